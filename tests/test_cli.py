@@ -263,7 +263,7 @@ def app(**options):
     callback()  # an exception in a callback of a compiled library is lost, and Python prints its traceback
     time.sleep(30)
 
-cli.app, cli.AGAIN_S = app, 0.5
+cli.app, cli.SETTINGS = app, cli.InterruptSettings(0.5)
 cli.main()
 """
 

@@ -13,7 +13,7 @@ from test_cli import ONE_THREAD
 
 import avis_ctrl
 from avis_ctrl.measurement.formats import write_campaign
-from avis_ctrl.measurement.formats.hdf5_writing import STRUCTURE, PatientFile
+from avis_ctrl.measurement.formats.hdf5_writing import SETTINGS, PatientFile
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.simulation.campaign_data import simulate_campaign
@@ -137,6 +137,6 @@ def test_small_pieces_are_read_again_after_the_disk_refused_and_large_ones_are_n
         file = PatientFile(full.fileno())
         file.write(b"structure")
         assert isinstance(file.refused, OSError)
-        file.write(bytes(STRUCTURE + 1))
+        file.write(bytes(SETTINGS.metadata_bytes + 1))
         assert set(file.kept) == {0} and bytes(file.kept[0]) == b"structure"
-        assert file.tell() == file.end == 9 + STRUCTURE + 1
+        assert file.tell() == file.end == 9 + SETTINGS.metadata_bytes + 1

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import warnings
+from dataclasses import dataclass
 from types import FrameType
 from typing import Annotated, Any
 
@@ -27,7 +28,16 @@ from avis_ctrl.measurement.layouts import FORMATS
 # One line per paragraph: the terminal wraps them.
 LAYOUTS = "\n\n".join(" ".join(part.split()) for part in FORMATS.split("\n\n"))
 INTERRUPTED = UserInterruptError.exit_code
-AGAIN_S = 3.0  # time for clean-up before the interrupt is repeated
+
+
+@dataclass(frozen=True)
+class InterruptSettings:
+    """again_s : time until an interrupt is repeated [s]: enough for clean-up after the first one."""
+
+    again_s: float = 3.0
+
+
+SETTINGS = InterruptSettings()
 
 # Markdown: paragraphs of the help are wrapped to the terminal.
 app = typer.Typer(
@@ -87,10 +97,10 @@ app.add_typer(new, name="new")
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, and again after AGAIN_S: one raised inside a callback of compiled code is lost."""
+    """Raise KeyboardInterrupt, and again after `again_s`: one raised inside a callback of compiled code is lost."""
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _interrupt)
-        signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+        signal.setitimer(signal.ITIMER_REAL, SETTINGS.again_s)
     raise KeyboardInterrupt
 
 

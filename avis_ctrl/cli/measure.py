@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,9 +14,17 @@ from avis_ctrl.cli.file_options import EXCITATION, PERIOD, SAMPLE_RATE, UNIT_Y, 
 from avis_ctrl.cli.options import Options
 from avis_ctrl.errors import InputError
 
-# Fraction of the largest level at which nothing clips: a rig may respond more strongly than its file predicts, but not
-# twice as strongly.
-LEVEL_SHARE = 0.5
+
+@dataclass(frozen=True)
+class LevelSettings:
+    """share : fraction of the largest level at which nothing clips [1]: a rig may respond more strongly than its file
+    predicts, but not twice as strongly.
+    """
+
+    share: float = 0.5
+
+
+SETTINGS = LevelSettings()
 RIG = Annotated[str, typer.Option("--rig", metavar="RIG", help="avis, halcyonics, halcyonics_loaded or a rig.toml")]
 
 
@@ -74,7 +83,7 @@ def excite(
             progress("level: a noise-free simulation of the rig, to find the level at which the sensors clip")
             plan = plan_from_table({"title": "level", "duration_s": period_s, "record": [{"excitation": "rest"}]})
             most = largest_level(open_loop(table, plan), signals, signals.u.shape[1] * (periods if periods < 4 else 4))
-            signals = signals.scaled_to(LEVEL_SHARE * most)
+            signals = signals.scaled_to(SETTINGS.share * most)
         write_signals(signals, out, periods if kind == "multisine" else 1, table.name)
     quantities = (signals.rms_V, signals.peak_V, signals.crest, signals.crest_before)
     terminal.table(

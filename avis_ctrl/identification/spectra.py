@@ -13,7 +13,7 @@ from avis_ctrl.identification.response import FLOOR, N_Q, FrequencyModel, Respon
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.response import GRAM_TOLERANCE
+from avis_ctrl.measurement.frequency_response.response import SETTINGS as SPAN
 
 # Lines of a record on which models are compared.
 THIN_LINES = 450
@@ -117,7 +117,7 @@ def _root(gram: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(gram / (safe[:, :, None] * safe[:, None, :]))
     if np.any(values < -1e-9 * np.maximum(values[:, -1:], np.finfo(float).tiny)):
         raise InputError("expected a Gram matrix without negative eigenvalues", field="gram")
-    kept = np.where(values > GRAM_TOLERANCE * values[:, -1:], values, 0.0)
+    kept = np.where(values > SPAN.gram * values[:, -1:], values, 0.0)
     return safe[:, :, None] * vectors * np.sqrt(kept)[:, None, :]
 
 

@@ -24,7 +24,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.norms import largest_singular_value
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.measurement.frequency_response.response import SPANNED
+from avis_ctrl.measurement.frequency_response.response import SETTINGS as SPAN
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
 
@@ -186,7 +186,7 @@ def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
     _, inside = measured.inverse_gram()
     line = int(np.argmax(np.real(np.trace(inside, axis1=1, axis2=2))))
     left, s, _ = np.linalg.svd(measured.gram[line][np.ix_(at, at)].real)
-    known = left[:, s > SPANNED**2 * s[0]]
+    known = left[:, s > SPAN.outside**2 * s[0]]
     return known
 
 

@@ -63,9 +63,6 @@ class Axis:
     silent: bool = False
 
 
-HERTZ = Axis("frequency [Hz]", "log", (0.1, 100.0))
-
-
 @dataclass(frozen=True, eq=False)
 class Curve:
     """A curve x, y (n,). Values that are not finite leave a gap; a curve with an empty label is not in the legend.
@@ -193,7 +190,7 @@ class Figure:
 
 def hertz(low: float = 0.1, high: float = 100.0) -> Axis:
     """Logarithmic frequency axis over a range [Hz]."""
-    return Axis(HERTZ.label, "log", (low, high))
+    return Axis("frequency [Hz]", "log", (low, high))
 
 
 def places(names: Sequence[str], label: str = "") -> tuple[np.ndarray, Axis]:

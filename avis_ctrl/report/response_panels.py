@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,11 +13,18 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log
 
 FLOOR = ("vx", "vy", "vz")
 MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
-# Maximum number of points of a measured response in a panel.
-MOST_POINTS = 60
-
 # Label, response (n, n_y, n_u), style.
 Model = tuple[str, np.ndarray, Style]
+
+
+@dataclass(frozen=True)
+class PanelSettings:
+    """points : maximum number of points of a measured response in a panel: more would hide the lines of the models."""
+
+    points: int = 60
+
+
+SETTINGS = PanelSettings()
 
 
 def drives(seen: MeasuredOverlay) -> list[int]:
@@ -36,7 +44,7 @@ def frequencies(seen: MeasuredOverlay) -> Axis:
     return hertz(float(seen.frequency_Hz[0]), float(seen.frequency_Hz[-1]))
 
 
-def thin(count: int, most: int) -> np.ndarray:
+def thin(count: int, most: int = SETTINGS.points) -> np.ndarray:
     """Indices of at most `most` of `count` points, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
@@ -49,7 +57,7 @@ def title(seen: MeasuredOverlay, i: int, j: int) -> str:
 def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
     """Measured points with a band of two standard deviations to each side, and a line for each model."""
     f, size, two = seen.frequency_Hz, np.abs(seen.measured[:, i, j]), 2 * seen.measured_std[:, i, j]
-    keep, lines = thin(len(f), MOST_POINTS), [(label, np.abs(G[:, i, j]), style) for label, G, style in models]
+    keep, lines = thin(len(f)), [(label, np.abs(G[:, i, j]), style) for label, G, style in models]
     low = 0.5 * float(min(np.quantile(size, 0.02), *(line.min() for _, line, _ in lines)))
     high = 2.0 * float(max(size.max(), *(line.max() for _, line, _ in lines)))
     curves = (

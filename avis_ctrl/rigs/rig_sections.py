@@ -13,23 +13,23 @@ from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.floor_spectrum import shipped_spectra
 from avis_ctrl.rigs.instruments import Tolerances
 
-# In SI units no value of a table comes near this limit; it keeps products of such numbers finite.
-LIMIT = 1e12
-Number = Annotated[float, Field(ge=-LIMIT, le=LIMIT)]
-Positive = Annotated[float, Field(gt=0, le=LIMIT)]
-NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
-
 
 @dataclass(frozen=True)
 class RigLimits:
     """farthest_m : maximum distance of a point from the origin along each axis [m]. No table is larger, and for distant
-    points the inertia is lost in the round-off of m r^2.
+        points the inertia is lost in the round-off of m r^2.
+    largest : maximum size of any number [SI unit of its key]: no value of a table comes near it, and products of such
+        numbers are finite.
     """
 
     farthest_m: float = 100.0
+    largest: float = 1e12
 
 
 LIMITS = RigLimits()
+Number = Annotated[float, Field(ge=-LIMITS.largest, le=LIMITS.largest)]
+Positive = Annotated[float, Field(gt=0, le=LIMITS.largest)]
+NotNegative = Annotated[float, Field(ge=0, le=LIMITS.largest)]
 
 
 def _not_far(length: float) -> float:

@@ -18,7 +18,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
-from avis_ctrl.rigs.rig_sections import LIMIT, Band, ElectronicsSection, Spectrum
+from avis_ctrl.rigs.rig_sections import LIMITS, Band, ElectronicsSection, Spectrum
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
@@ -29,8 +29,8 @@ def _different(axes: list[str]) -> list[str]:
     return axes
 
 
-Positive = Annotated[float, Field(gt=0, le=LIMIT)]
-NotNegative = Annotated[float, Field(ge=0, le=LIMIT)]
+Positive = Annotated[float, Field(gt=0, le=LIMITS.largest)]
+NotNegative = Annotated[float, Field(ge=0, le=LIMITS.largest)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
 Decibel = Annotated[float, Field(ge=-200, le=200)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
@@ -50,7 +50,7 @@ class ChainUncertainty(Section):
 
     low_percent: Percent
     crossover_Hz: Positive
-    high_percent: Annotated[float, Field(gt=100, le=LIMIT)]
+    high_percent: Annotated[float, Field(gt=100, le=LIMITS.largest)]
 
 
 class UncertaintySection(Section):
@@ -133,7 +133,7 @@ class EffortSection(Section):
 
     floor_velocity_m_per_s: Positive
     bandwidth_Hz: Positive
-    reduction: Annotated[float, Field(gt=1, le=LIMIT)] = 30.0
+    reduction: Annotated[float, Field(gt=1, le=LIMITS.largest)] = 30.0
     offset_percent: Percent = 10.0
     offset_corner_Hz: Positive = 0.003
 

@@ -49,7 +49,7 @@ def test_numbers_survive_every_spelling(tmp_path_factory, table, separator, comm
         lines.append(text.replace(".", ",") if comma else text)
     path.write_bytes((newline.join(lines) + newline * final).encode(encoding))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(csv, "CHUNK", chunk)
+        patch.setattr(csv, "SETTINGS", csv.CsvSettings(chunk))
         campaign = read_measurements(path, excitation="noise", level_V=1.0)
     record = campaign.records[0].load()
     np.testing.assert_array_equal(np.hstack([record.u, record.y]), table)

@@ -279,7 +279,7 @@ def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeyp
     assert "has 3 GB; this format is read whole" in refusal(path, columns={"u": "u", "y": ["y", "z"]})
     record = read_measurements(path, excitation="noise", level_V=1.0).records[0]  # one variable each stays on disk
     assert record.load(samples - 3).y.shape == (3, 1)
-    monkeypatch.setattr(common, "LARGEST_IN_MEMORY", 5000)
+    monkeypatch.setattr(common, "SETTINGS", common.ReadingSettings(5000))
     scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
     assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refusal(path)
     scipy.io.savemat(path, {"u": np.zeros(200), "y": np.zeros(200), "fs": 1.0}, do_compression=True)

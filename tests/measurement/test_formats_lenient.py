@@ -86,7 +86,7 @@ def test_hints_hold_for_every_record(path, rng, version):
 def test_level_of_a_long_record_on_disk_is_that_of_all_its_pieces(path, rng, monkeypatch):
     from avis_ctrl.measurement.formats import records
 
-    monkeypatch.setattr(records, "PIECE", 37)
+    monkeypatch.setattr(records, "SETTINGS", records.RecordSettings(piece=37))
     long = record(rng)
     long["u"][100:] *= 30
     Matlab73(path, {"records": long})

@@ -19,7 +19,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats import read_measurements
 from avis_ctrl.measurement.formats.matlab import variables
-from avis_ctrl.measurement.formats.matlab_tree import MOST_CELLS, Matrix, Unreadable
+from avis_ctrl.measurement.formats.matlab_tree import SETTINGS, Matrix, Unreadable
 
 TYPES = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "c16", "c8", "?"]
 
@@ -221,7 +221,7 @@ def test_deep_and_wide_structures_cost_nothing(path):
         file(
             "<",
             matrix("<", "deep", 1, (1, 1), deep),
-            matrix("<", "wide", 1, (MOST_CELLS + 1, 1), *[element("<", 14, b"")] * (MOST_CELLS + 1)),
+            matrix("<", "wide", 1, (SETTINGS.most_cells + 1, 1), *[element("<", 14, b"")] * (SETTINGS.most_cells + 1)),
             matrix("<", "none", 2, (1 << 30, 1), element("<", 5, struct.pack("<i", 8)), element("<", 1, b"")),
             matrix("<", "rows", 4, (1 << 30, 0), element("<", 16, b"")),
         )

@@ -11,12 +11,25 @@ behind the hold may have a higher peak.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.optimize import minimize
 
-# Exponents of the norm (powers of two), and maximum number of iterations for each.
-EXPONENTS = (4, 8, 16, 32, 64, 128, 256)
-STEPS = 60
+
+@dataclass(frozen=True)
+class CrestSettings:
+    """exponents : exponents of the norm, powers of two [1]: with the last one the norm is within a few per cent of the
+        peak.
+    steps : maximum number of iterations for each exponent: the next one continues from the result, so that none has to
+        converge.
+    """
+
+    exponents: tuple[int, ...] = (4, 8, 16, 32, 64, 128, 256)
+    steps: int = 60
+
+
+SETTINGS = CrestSettings()
 
 
 def crest_factor(u: np.ndarray) -> np.ndarray:
@@ -67,9 +80,11 @@ def low_crest_phases(
         gradient = np.real(1j * lines_now * np.conj(np.fft.rfft(slope)[:, lines])).sum(axis=0)
         return float(np.log(peak) + np.log(total / u.size) / p), gradient
 
-    for p in (0, *EXPONENTS):
+    for p in (0, *SETTINGS.exponents):
         if p:
-            phase = minimize(log_norm, phase, args=(p,), jac=True, method="L-BFGS-B", options={"maxiter": STEPS}).x
+            phase = minimize(
+                log_norm, phase, args=(p,), jac=True, method="L-BFGS-B", options={"maxiter": SETTINGS.steps}
+            ).x
         peak = float(np.max(np.abs(signals(phase)[1])))
         if peak < lowest:
             best, lowest = phase, peak

@@ -34,8 +34,16 @@ from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_cres
 
 Lines = Literal["full", "odd", "odd_detection"]
 Scheme = Literal["orthogonal", "zippered"]
-# Maximum of samples times drives times records: 1 GiB.
-MOST_VOLTAGES = 2**27
+
+
+@dataclass(frozen=True)
+class SizeSettings:
+    """most_voltages : maximum of samples times drives times records: 1 GiB."""
+
+    most_voltages: int = 2**27
+
+
+SETTINGS = SizeSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,6 +341,6 @@ def _check_common(settings: MultisineSettings | NoiseSettings) -> None:
 
 
 def _check_size(voltages: float, field: str) -> None:
-    if voltages > MOST_VOLTAGES:
-        message = f"expected at most {MOST_VOLTAGES} voltages in all records and drives, which fit into memory"
+    if voltages > SETTINGS.most_voltages:
+        message = f"expected at most {SETTINGS.most_voltages} voltages in all records and drives, which fit into memory"
         raise InputError(f"{message}; there would be {voltages:.3g}", field=field)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,8 +25,17 @@ INPUT_UNITS, OUTPUT_UNITS, FLOOR_UNITS = ("V", "N"), ("V", "m/s", "m/s^2", "m"),
 INPUT_NAME = r"u_?\w*|a[xyz]?\d+"  # usual names of inputs
 ALLOWED = {"u": INPUT_UNITS, "y": OUTPUT_UNITS, "floor": FLOOR_UNITS}
 
-# Largest file that is read whole into memory; text and compressed numbers need about twice as much during conversion.
-LARGEST_IN_MEMORY = 1_500_000_000  # bytes
+
+@dataclass(frozen=True)
+class ReadingSettings:
+    """most_bytes : largest file that is read whole into memory [bytes]: text and compressed numbers need about twice as
+    much during conversion.
+    """
+
+    most_bytes: int = 1_500_000_000
+
+
+SETTINGS = ReadingSettings()
 
 
 def short(error: BaseException) -> str:
@@ -97,13 +107,13 @@ def require_small(path: Path, size: int | None = None) -> int:
 
     Raises
     ------
-    InputError : more than `LARGEST_IN_MEMORY`; only HDF5 campaigns are read in pieces.
+    InputError : more than `ReadingSettings.most_bytes`; only HDF5 campaigns are read in pieces.
     """
     size = path.stat().st_size if size is None else size
-    if size > LARGEST_IN_MEMORY:
+    if size > SETTINGS.most_bytes:
         message = (
-            f"has {size / 1e9:.3g} GB; this format is read whole, up to {LARGEST_IN_MEMORY / 1e9:.3g} GB: convert the "
-            "file to an HDF5 campaign (/records/00/u and y), which is read in pieces"
+            f"has {size / 1e9:.3g} GB; this format is read whole, up to {SETTINGS.most_bytes / 1e9:.3g} GB: convert "
+            "the file to an HDF5 campaign (/records/00/u and y), which is read in pieces"
         )
         raise InputError(message, file=path)
     return size

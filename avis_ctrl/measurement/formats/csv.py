@@ -27,11 +27,23 @@ from avis_ctrl.measurement.formats.common import INPUT_NAME, existing_file, is_n
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, sample_rate_from
 
-CHUNK = 1 << 16  # lines that are converted to numbers at once
-LONGEST_LINE = 1 << 20  # characters
 USUAL = {"t": r"t|time|t_s|time_s", "u": INPUT_NAME, "y": r"y_?\w*|s[xyz]?\d+"}
 STATED = ("sample_rate_Hz", "level_V", "start_s", "period_s", "excitation")
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+
+
+@dataclass(frozen=True)
+class CsvSettings:
+    """chunk_lines : lines that are converted to numbers at once: the text of a whole file need not fit into memory.
+    longest_line : length of a line [characters] from which the file is rejected: no header is that long, and binary
+        data without line ends must not fill the memory.
+    """
+
+    chunk_lines: int = 1 << 16
+    longest_line: int = 1 << 20
+
+
+SETTINGS = CsvSettings()
 
 
 @dataclass(frozen=True)
@@ -88,9 +100,9 @@ def _lines(stream: TextIO) -> Iterator[str]:
     """Lines without line ends; bytes that are not UTF-8 are read as Latin-1, the older encoding of measurement
     software.
     """
-    while line := stream.readline(LONGEST_LINE):
-        if len(line) == LONGEST_LINE:
-            raise InputError(f"expected lines shorter than {LONGEST_LINE} characters")
+    while line := stream.readline(SETTINGS.longest_line):
+        if len(line) == SETTINGS.longest_line:
+            raise InputError(f"expected lines shorter than {SETTINGS.longest_line} characters")
         line = line.rstrip("\r\n\x1a").replace('"', "")
         if not line.isascii() and any("\udc80" <= letter <= "\udcff" for letter in line):
             line = line.encode("utf-8", "surrogateescape").decode("latin-1")
@@ -234,7 +246,7 @@ def _table(lines: Iterator[str], layout: Layout, use: list[int]) -> tuple[np.nda
     """(rows, columns used) numbers, read chunk by chunk; and the place of a row in the file, for messages."""
     blocks, numbers, row, decimal_comma = [], [], layout.lines, None
     separators = len(layout.names) - 1
-    while chunk := list(islice(lines, CHUNK)):
+    while chunk := list(islice(lines, SETTINGS.chunk_lines)):
         if decimal_comma is None:
             decimal_comma = layout.separator != "," and any("," in line for line in chunk)
         if decimal_comma:

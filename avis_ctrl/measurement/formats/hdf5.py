@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,18 @@ DATASETS = {
     "variance": "fiu",
     **dict.fromkeys(COVARIANCES, "fiuc"),
 }
-CHUNK = 1 << 14  # samples per chunk on disk
+
+
+@dataclass(frozen=True)
+class ChunkSettings:
+    """samples : samples per chunk on disk: with 128 KiB for each channel, a chunk is larger than what `WritingSettings`
+    takes for metadata.
+    """
+
+    samples: int = 1 << 14
+
+
+SETTINGS = ChunkSettings()
 
 
 def read(path: Path, columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign | FrequencyResponse:
@@ -235,7 +247,7 @@ def _write_record(group: h5py.Group, record: RecordSource, longest: int) -> None
     for role in ROLES if header.floor_names else ROLES[:2]:
         names, unit = getattr(header, f"{role}_names"), getattr(header, f"{role}_unit")
         shape = (header.samples, len(names))
-        chunks = (min(CHUNK, header.samples), len(names)) if names else None
+        chunks = (min(SETTINGS.samples, header.samples), len(names)) if names else None
         datasets[role] = group.create_dataset(role, shape, np.float64, chunks=chunks)
         datasets[role].attrs["names"] = np.array(names, dtype=h5py.string_dtype())
         datasets[role].attrs["unit"] = unit

@@ -10,14 +10,24 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 
 from avis_ctrl.files import whole_file
 
-# Pieces up to this size [bytes] may be metadata, which HDF5 reads back; chunks of data are larger and are not read.
-STRUCTURE = 1 << 16
+
+@dataclass(frozen=True)
+class WritingSettings:
+    """metadata_bytes : size up to which a piece may be metadata [bytes], which HDF5 reads back; chunks of data are
+    larger and are not read.
+    """
+
+    metadata_bytes: int = 1 << 16
+
+
+SETTINGS = WritingSettings()
 
 
 class PatientFile:
@@ -40,7 +50,7 @@ class PatientFile:
                 done += os.pwrite(self.descriptor, view[done:], self.at + done)
         except OSError as error:
             self.refused = error
-        if self.refused is not None and len(view) <= STRUCTURE:
+        if self.refused is not None and len(view) <= SETTINGS.metadata_bytes:
             self.kept[self.at] = bytes(view)
         self.at += len(view)
         self.end = max(self.end, self.at)

@@ -13,8 +13,24 @@ from typing import Any
 
 import numpy as np
 
-DEEPEST = 8  # levels of nested structs and cells
-MOST_CELLS = 10_000  # of one cell or struct array
+
+@dataclass(frozen=True)
+class TreeSettings:
+    """Limits for damaged files; campaigns stay far below them.
+
+    deepest : levels of nested structs and cells.
+    most_cells : cells of one cell array, or structs of one struct array.
+    most_items : variables, cells and fields of a v7.3 file: its references may be circular.
+    most_dimensions : dimensions of an array in a v5 file: HDF5, and thus v7.3, has no more.
+    """
+
+    deepest: int = 8
+    most_cells: int = 10_000
+    most_items: int = 200_000
+    most_dimensions: int = 32
+
+
+SETTINGS = TreeSettings()
 
 
 @dataclass(frozen=True)

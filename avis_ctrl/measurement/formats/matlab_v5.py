@@ -20,7 +20,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats.common import require_small
-from avis_ctrl.measurement.formats.matlab_tree import DEEPEST, EMPTY, MOST_CELLS, TOO_DEEP, Matrix, Unreadable
+from avis_ctrl.measurement.formats.matlab_tree import EMPTY, SETTINGS, TOO_DEEP, Matrix, Unreadable
 
 HEADER, TAG = 128, 8
 MATRIX, COMPRESSED = 14, 15
@@ -32,7 +32,6 @@ CELL, STRUCT, OBJECT, CHAR, SPARSE, FUNCTION, OPAQUE = 1, 2, 3, 4, 5, 16, 17
 CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 FOREIGN = {OBJECT: "MATLAB object", SPARSE: "sparse matrix", FUNCTION: "function handle", OPAQUE: "MATLAB object"}
 COMPLEX = 0x0800  # bit of the array flags
-MOST_DIMENSIONS = 32
 MOST_ELEMENTS = 1 << 31  # of an array in a v5 file
 HIGHEST_RATIO = 1032  # maximum expansion of a zlib stream
 
@@ -185,7 +184,7 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
         value = _text(elements, shape)
     elif own not in (CELL, STRUCT):
         raise _damaged(f"array flags: class {own} does not exist")
-    elif depth >= DEEPEST:
+    elif depth >= SETTINGS.deepest:
         return name, TOO_DEEP
     else:
         value = _cells(elements, shape, depth) if own == CELL else _structs(elements, shape, depth)
@@ -196,7 +195,7 @@ def _matrix(body: memoryview, order: str, depth: int) -> tuple[str, Any]:
 
 def _shape(dimensions: list[int]) -> tuple[int, ...]:
     """Checked dimensions, whose product cannot overflow, even for empty arrays."""
-    sane = 2 <= len(dimensions) <= MOST_DIMENSIONS and min(dimensions) >= 0
+    sane = 2 <= len(dimensions) <= SETTINGS.most_dimensions and min(dimensions) >= 0
     if not sane or math.prod(max(length, 1) for length in dimensions) > MOST_ELEMENTS:
         raise _damaged(f"dimensions: {str(dimensions)[:60]} are not possible")
     return tuple(dimensions)
@@ -262,8 +261,8 @@ def _cells(elements: Elements, shape: tuple[int, ...], depth: int) -> Any:
     """A cell array in MATLAB's linear order."""
     count = math.prod(shape)
     _require_room(elements, count)
-    if count > MOST_CELLS:
-        return Unreadable(f"cell array of more than {MOST_CELLS} cells")
+    if count > SETTINGS.most_cells:
+        return Unreadable(f"cell array of more than {SETTINGS.most_cells} cells")
     return [_inner(elements, f"cell {i + 1}", depth) for i in range(count)]
 
 
@@ -283,8 +282,8 @@ def _structs(elements: Elements, shape: tuple[int, ...], depth: int) -> Any:
     _require_room(elements, count * len(names))
     if count != 1 and not names:
         return Unreadable("struct array without fields")
-    if count > MOST_CELLS:
-        return Unreadable(f"struct array of more than {MOST_CELLS} structs")
+    if count > SETTINGS.most_cells:
+        return Unreadable(f"struct array of more than {SETTINGS.most_cells} structs")
     items = [{name: _inner(elements, f"field {name}", depth) for name in names} for _ in range(count)]
     return items[0] if count == 1 else items
 

@@ -15,9 +15,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats import stored
 from avis_ctrl.measurement.formats.common import printable, reading, require_small
-from avis_ctrl.measurement.formats.matlab_tree import DEEPEST, EMPTY, MOST_CELLS, TOO_DEEP, Matrix, Unreadable
-
-MOST_ITEMS = 200_000  # of a file: references may be circular
+from avis_ctrl.measurement.formats.matlab_tree import EMPTY, SETTINGS, TOO_DEEP, Matrix, Unreadable
 
 
 def variables(path: Path) -> dict[str, Any]:
@@ -42,9 +40,9 @@ class Tree:
     def value(self, item: Any, depth: int) -> Any:
         """Value of a group or data set."""
         self.items += 1
-        if self.items > MOST_ITEMS:
-            raise InputError(f"expected at most {MOST_ITEMS} variables, cells and fields; damaged?")
-        if depth > DEEPEST:
+        if self.items > SETTINGS.most_items:
+            raise InputError(f"expected at most {SETTINGS.most_items} variables, cells and fields; damaged?")
+        if depth > SETTINGS.deepest:
             return TOO_DEEP
         if not isinstance(item, (h5py.Group, h5py.Dataset)):
             return Unreadable("unknown item")
@@ -84,9 +82,9 @@ class Tree:
         return lines[0] if len(lines) == 1 else lines
 
     def _references(self, item: h5py.Dataset, shape: tuple[int, ...]) -> list[Any]:
-        if math.prod(shape) > MOST_CELLS:
+        if math.prod(shape) > SETTINGS.most_cells:
             name = printable(stored.full_name(item))
-            raise InputError(f"expected at most {MOST_CELLS} cells", field=name, value=math.prod(shape))
+            raise InputError(f"expected at most {SETTINGS.most_cells} cells", field=name, value=math.prod(shape))
         return list(stored.values(item).reshape(-1))  # dimensions are stored reversed: this is MATLAB's linear order
 
     def _behind(self, reference: Any, depth: int) -> Any:

@@ -25,7 +25,6 @@ from avis_ctrl.measurement.formats.stored import Columns, StoredRecord
 
 ROLES = ("t", "u", "y", "floor", "sample_rate_Hz", "u_names", "y_names")
 UNNAMED = "unnamed"  # rig of a campaign whose file states none
-PIECE = 1 << 18  # samples of u on disk that are loaded at once
 
 Mapped = Mapping[str, Any]
 
@@ -33,10 +32,12 @@ Mapped = Mapping[str, Any]
 @dataclass(frozen=True)
 class RecordSettings:
     """same_rate : relative difference of two sample rates below which they are from the same clock [1]: rounding of
-    time stamps causes smaller differences, and the quartz clocks of two instruments differ by more.
+        time stamps causes smaller differences, and the quartz clocks of two instruments differ by more.
+    piece : samples of u on disk that are loaded at once: 2 MiB for each drive.
     """
 
     same_rate: float = 1e-6
+    piece: int = 1 << 18
 
 
 SETTINGS = RecordSettings()
@@ -222,7 +223,7 @@ def _units(role: str, part: Part, hints: Hints) -> tuple[str, tuple[float, ...],
 def _root_mean_square(u: np.ndarray | Columns, names: Sequence[str], path: str) -> float:
     """R.m.s. of samples in memory or on disk, piece by piece."""
     total = 0.0
-    for start, stop in ranges(len(u), PIECE):
+    for start, stop in ranges(len(u), SETTINGS.piece):
         piece = u.load(path, names, "u", start, stop) if isinstance(u, Columns) else u[start:stop]
         # Scaled by a power of two, so that no square overflows.
         exponent = np.frexp(np.max(np.abs(piece)))[1]

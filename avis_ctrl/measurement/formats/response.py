@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,16 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
 COVARIANCES = ("noise", "gram", "measurement_noise", "distortion")
 SINGLE_PRECISION = 2.0**-24
-ROUNDING = 1e-5  # a printed coherence may exceed 1 by this much
+
+
+@dataclass(frozen=True)
+class CoherenceSettings:
+    """rounding : excess of a coherence over 1 that is accepted [1]: printed numbers are rounded."""
+
+    rounding: float = 1e-5
+
+
+SETTINGS = CoherenceSettings()
 
 
 def coherence_variance(value: np.ndarray, coherence: np.ndarray, averages: float) -> np.ndarray:
@@ -179,7 +189,7 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
         raise InputError(message, field="coherence", value=coherence.shape)
     if coherence.shape != shape:
         raise InputError(f"expected shape {shape}", field="coherence", value=coherence.shape)
-    if np.any(coherence < 0) or np.any(coherence > 1 + ROUNDING):
+    if np.any(coherence < 0) or np.any(coherence > 1 + SETTINGS.rounding):
         worst = coherence.flat[np.argmax(np.abs(coherence - 0.5))]
         raise InputError("expected values from 0 to 1", field="coherence", value=float(worst))
     if averages is None:

@@ -8,9 +8,20 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 
-# Smallest eigenvalue, relative to the largest, of a direction that counts as spanned (Gram matrix of inputs of unit
-# size); and fraction of a combination of inputs that may lie outside the spanned directions.
-GRAM_TOLERANCE, SPANNED = 1e-13, 1e-4
+
+@dataclass(frozen=True)
+class SpanSettings:
+    """gram : smallest eigenvalue, relative to the largest, of a direction that counts as spanned (Gram matrix of inputs
+        of unit size) [1]: smaller ones may be round-off.
+    outside : fraction of a combination of inputs that may lie outside the spanned directions [1]: gains are known to
+        1 % at best, so that a smaller part does not matter.
+    """
+
+    gram: float = 1e-13
+    outside: float = 1e-4
+
+
+SETTINGS = SpanSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +118,7 @@ class FrequencyResponse:
         size = np.sqrt(np.real(np.einsum("nii->ni", self.gram)))
         size = np.where(size > 0, size, 1.0)
         values, vectors = np.linalg.eigh(self.gram / (size[:, :, None] * size[:, None, :]))
-        known = values > GRAM_TOLERANCE * values[:, -1:]
+        known = values > SETTINGS.gram * values[:, -1:]
         inverse = np.where(known, 1 / np.where(known, values, 1.0), 0.0)
         adjoint = np.swapaxes(vectors.conj(), 1, 2)
         return (
@@ -124,7 +135,7 @@ class FrequencyResponse:
         # Combinations are scaled to inputs of unit size; a combination with a silent input is not spanned.
         scaled = V[None] / np.where(size > 0, size, np.finfo(float).tiny ** 0.25)[:, :, None]
         left = scaled - self.inverse_gram()[1] @ scaled
-        return np.asarray(np.linalg.norm(left, axis=1) < SPANNED * np.linalg.norm(scaled, axis=1))
+        return np.asarray(np.linalg.norm(left, axis=1) < SETTINGS.outside * np.linalg.norm(scaled, axis=1))
 
     def along(self, V: np.ndarray, names: tuple[str, ...], unit: str) -> FrequencyResponse:
         """Response to inputs in the proportions of V (n_u, k), with new names and unit, on the lines where it is known.

@@ -23,10 +23,12 @@ class CopySettings:
         copy of the other: independent sensor noise is larger.
     alike : the same for the model's channels: below it a motion explains that two sensors read alike. Parameter errors
         of a few per cent make symmetric sensors differ by this much.
+    fewest : minimum number of samples: two always agree up to an offset and a factor, this many do not by chance.
     """
 
     different: float = 1e-3
     alike: float = 0.05
+    fewest: int = 8
 
 
 COPIES = CopySettings()
@@ -277,14 +279,10 @@ def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) 
     return [expected.index(n) for n in names] if set(names) <= set(expected) and len(expected) == rows else None
 
 
-# Two samples always agree up to an offset and a factor; this many do not agree by chance.
-FEWEST_ALIKE = 8
-
-
 def _copies(seen: Excerpt) -> list[tuple[int, int, float, float]]:
     """(i, k, scale, relative difference): y_k = scale y_i + constant, within `CopySettings.different`."""
     y = seen.first.y - seen.first.y.mean(axis=0)
-    if len(y) < FEWEST_ALIKE:
+    if len(y) < COPIES.fewest:
         return []
     power = np.sum(y**2, axis=0)
     return [

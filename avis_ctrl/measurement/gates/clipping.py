@@ -10,8 +10,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
     Expectation,
     Finding,
     Limit,
@@ -99,7 +99,7 @@ class Clipping(Gate):
 
     def conclude(self, kept: list[list[_Ends]], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         rows = [row for rows in kept for row in rows]
-        level = FALSE_ALARM / (2 * len(rows))
+        level = FINDING.false_alarm / (2 * len(rows))
         wrong = [row for row in rows if row.unit]
         names = tuple(dict.fromkeys(row.channel for row in wrong))
         found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
@@ -246,7 +246,7 @@ def repeated_extreme(x: np.ndarray, periods: int = 1) -> tuple[float, float, flo
         if n >= max(5.0, SETTINGS.flatter * others):
             p = len(trials) * float(stats.binom.sf(n - 1, n + others, SINE_TOP / (1 + SINE_TOP)))
             best = min(best, (top, p, width), key=lambda b: b[1])
-            if p < FALSE_ALARM / 1000:  # the narrowest significant width gives the best count
+            if p < FINDING.false_alarm / 1000:  # the narrowest significant width gives the best count
                 break
     return best
 

@@ -10,16 +10,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    curves,
-    quoted,
-    samples_over_time,
-)
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, quoted, samples_over_time
 from avis_ctrl.measurement.gates.h1 import h1, moving, record_spectra, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
@@ -161,7 +153,7 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
     u, y, wrap = usable(seen)
     if not moving(u) or (estimate := h1([record_spectra(u, y, wrap, seen.header.sample_rate_Hz)])) is None:
         return None
-    limit = stats.beta.isf(FALSE_ALARM / estimate.coherence.size, estimate.rank, estimate.dof)
+    limit = stats.beta.isf(FINDING.false_alarm / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)
     return np.max(ratio, axis=0) / (limit / max(1 - limit, 1e-12))
 
@@ -172,4 +164,4 @@ def _sine_excess(seen: Excerpt) -> np.ndarray:
     n_u = piece.u.shape[1]
     fit = fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), n_u, seen.header.sample_rate_Hz)
     ratio = np.abs(fit.X[n_u:]) ** 2 / 4 * fit.samples / np.maximum(fit.residual_rms[n_u:] ** 2, 1e-300)
-    return ratio / float(stats.f.isf(FALSE_ALARM / len(ratio), 2, fit.samples - 3))
+    return ratio / float(stats.f.isf(FINDING.false_alarm / len(ratio), 2, fit.samples - 3))

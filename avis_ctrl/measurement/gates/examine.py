@@ -10,7 +10,8 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_map import ORDER, POLARITY, ChannelMap
 from avis_ctrl.measurement.gates.clipping import Clipping
 from avis_ctrl.measurement.gates.dead_channel import DeadChannel
-from avis_ctrl.measurement.gates.excerpt import LONGEST, Gate, excerpt
+from avis_ctrl.measurement.gates.excerpt import SETTINGS as EXCERPT
+from avis_ctrl.measurement.gates.excerpt import Gate, excerpt
 from avis_ctrl.measurement.gates.finding import Expectation, Finding
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import MissingSamples
@@ -39,7 +40,9 @@ CONSEQUENCES = (SignalToNoise.name, Coherence.name, Periodicity.name, Comparison
 OF_ALL = (ORDER, POLARITY)
 
 
-def examine(campaign: Campaign, expectation: Expectation | None = None, longest: int = LONGEST) -> tuple[Finding, ...]:
+def examine(
+    campaign: Campaign, expectation: Expectation | None = None, longest: int = EXCERPT.longest
+) -> tuple[Finding, ...]:
     """Findings of all gates on a campaign, at least one per gate, with pictures.
 
     Records longer than `longest` samples are examined in four evenly spaced pieces with this many samples in total; the

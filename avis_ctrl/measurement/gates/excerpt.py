@@ -11,8 +11,18 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader, RecordSource
 from avis_ctrl.measurement.gates.finding import Expectation, Finding
 
-LONGEST = 1 << 20
-PIECES = 4
+
+@dataclass(frozen=True)
+class ExcerptSettings:
+    """longest : samples of a record that are examined at most: 8 MiB for each channel.
+    pieces : number of pieces of a longer record: its start, its end, and two places between.
+    """
+
+    longest: int = 1 << 20
+    pieces: int = 4
+
+
+SETTINGS = ExcerptSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,18 +61,18 @@ class Excerpt:
         return np.concatenate(cut)
 
 
-def excerpt(record: RecordSource, longest: int = LONGEST) -> Excerpt:
+def excerpt(record: RecordSource, longest: int = SETTINGS.longest) -> Excerpt:
     """The record, or four evenly spaced pieces of at most `longest` samples in total, cut between periods; one piece if
     a period is longer than a quarter of `longest`.
     """
     samples, period = record.header.samples, record.header.period_samples or 1
     if samples <= longest:
         return Excerpt(record.header, (record.load(),))
-    size = longest // PIECES
+    size = longest // SETTINGS.pieces
     if period > size:
         return Excerpt(record.header, (record.load(0, longest),))
     size = size // period * period
-    starts = np.linspace(0, samples - size, PIECES).astype(int) // period * period
+    starts = np.linspace(0, samples - size, SETTINGS.pieces).astype(int) // period * period
     return Excerpt(record.header, tuple(record.load(int(start), int(start) + size) for start in starts))
 
 

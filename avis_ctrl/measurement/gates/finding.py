@@ -13,8 +13,6 @@ from avis_ctrl.errors import InputError
 Severity = Literal["ok", "note", "warning", "stop"]
 SEVERITIES: tuple[str, ...] = ("ok", "note", "warning", "stop")
 Response = Callable[[np.ndarray, tuple[str, ...]], np.ndarray]
-# Probability that a gate raises an alarm on clean data of one campaign, over all its channels and records.
-FALSE_ALARM = 0.01
 
 
 @dataclass(frozen=True)
@@ -22,10 +20,13 @@ class FindingSettings:
     """most_points : maximum number of points of a line: a panel is some hundred pixels wide, with two points
         per pixel.
     most_names : channels that a sentence names; further channels are counted.
+    false_alarm : probability that a gate raises an alarm on clean data of one campaign, over all its channels and
+        records [1]: an alarm then deserves a look at the data.
     """
 
     most_points: int = 2000
     most_names: int = 4
+    false_alarm: float = 0.01
 
 
 SETTINGS = FindingSettings()

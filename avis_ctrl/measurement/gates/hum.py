@@ -10,16 +10,8 @@ from scipy import signal, stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    over_frequency,
-)
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, Severity, over_frequency
 from avis_ctrl.measurement.gates.h1 import driven_lines
 
 MAINS_HZ = (50.0, 60.0)
@@ -100,14 +92,14 @@ class Hum(Gate):
         hits: dict[tuple[int, float], list[tuple[_Kept, _Line]]] = {}
         for k in kept:
             for line in k.lines:
-                if line.p < FALSE_ALARM / tested and line.ratio > SETTINGS.least_ratio:
+                if line.p < FINDING.false_alarm / tested and line.ratio > SETTINGS.least_ratio:
                     hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
         found = [self._finding(campaign, mains, some) for (_, mains), some in sorted(hits.items())]
         note = f"; {passed} lines are excited by u and were not tested" if passed else ""
         what = "No mains hum was found" if tested else "No line of the mains could be tested"
         sentence = f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note})."
         picture = self._picture(kept[-1], 0, campaign, MAINS_HZ)
-        return found or [Finding(self.name, "ok", sentence, limit=FALSE_ALARM, picture=picture)]
+        return found or [Finding(self.name, "ok", sentence, limit=FINDING.false_alarm, picture=picture)]
 
     def _finding(self, campaign: Campaign, mains: float, hits: list[tuple[_Kept, _Line]]) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)

@@ -11,7 +11,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import FALSE_ALARM, Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
 from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, moving, segment_length, spectra
 
 
@@ -72,7 +73,7 @@ class MissingSamples(Gate):
         stepped = [
             one
             for one in delay
-            if (step := delay_step(one, FALSE_ALARM)) is not None
+            if (step := delay_step(one, FINDING.false_alarm)) is not None
             and SETTINGS.jump_samples < abs(step[1]) <= SETTINGS.longest_samples
             and not drifts(one, step[0])
             and explained(seen, t, *step) > SETTINGS.explains
@@ -81,7 +82,7 @@ class MissingSamples(Gate):
         return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        level = FALSE_ALARM / max(1, sum(k.delay.size for k in kept))
+        level = FINDING.false_alarm / max(1, sum(k.delay.size for k in kept))
         found = [*self._overlaps(kept), *(f for k in kept for f in self._faults(k, level))]
         longest = max(kept, key=lambda k: len(k.t))
         comparable = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]

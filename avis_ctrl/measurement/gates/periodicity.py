@@ -9,17 +9,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    curves,
-    percent,
-    quoted,
-    times,
-)
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, percent, quoted, times
 
 
 @dataclass(frozen=True)
@@ -74,7 +65,7 @@ class Periodicity(Gate):
             sentence = "Periodicity was not tested: no record is periodic with four periods or more."
             picture = Picture("Periods against the last ones", "period", "ratio to noise [-]", ())
             return [Finding(self.name, "ok", sentence, picture=picture)]
-        level = FALSE_ALARM / sum(k.T.size for k in judged)
+        level = FINDING.false_alarm / sum(k.T.size for k in judged)
         found: list[Finding] = []
         drops: list[tuple[int, _Kept, float, Picture]] = []
         for k in judged:

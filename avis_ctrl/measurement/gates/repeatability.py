@@ -11,8 +11,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
     Expectation,
     Finding,
     Limit,
@@ -125,10 +125,10 @@ class Comparison(Gate):
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
         pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
-        level = FALSE_ALARM / max(1, len(pairs) * n_y)
+        level = FINDING.false_alarm / max(1, len(pairs) * n_y)
         repeats = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
         apart = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
-        level = FALSE_ALARM / max(1, len(apart) * n_y)
+        level = FINDING.false_alarm / max(1, len(apart) * n_y)
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         untested = "Repeatability was not tested: no two driven records of one level and enough length."

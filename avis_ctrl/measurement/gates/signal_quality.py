@@ -10,8 +10,8 @@ from scipy import stats
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import (
-    FALSE_ALARM,
     Expectation,
     Finding,
     Limit,
@@ -192,7 +192,7 @@ class Coherence(Gate):
         middle = centres(best.f, bands)
         mean = np.array([free[b].mean(axis=0) for b in bands])
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
-        z = stats.norm.isf(FALSE_ALARM / mean.size)
+        z = stats.norm.isf(FINDING.false_alarm / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
         series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence

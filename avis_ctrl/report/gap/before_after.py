@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,9 +30,19 @@ from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
-PAIRS = 3
-# Letters per row of a stage's name under its bar, so that four names fit side by side on a phone.
-LETTERS = 13
+
+
+@dataclass(frozen=True)
+class BeforeAfterSettings:
+    """pairs : number of outputs, the worst, whose response is drawn: their figures fill a page.
+    letters : letters per row of a stage's name under its bar, so that four names fit side by side on a phone.
+    """
+
+    pairs: int = 3
+    letters: int = 13
+
+
+SETTINGS = BeforeAfterSettings()
 
 
 def before_after(found: GapFinding) -> Section:
@@ -80,7 +91,7 @@ def _worst(values: np.ndarray) -> np.ndarray:
 def ladder(gap: Gap) -> Figure:
     """Error of each stage as a bar, and the error due to noise alone as a line."""
     values = np.array([100 * one.nrmse for one in gap.stages])
-    place, axis = places([textwrap.fill(rung(one.name, k), LETTERS) for k, one in enumerate(gap.stages)])
+    place, axis = places([textwrap.fill(rung(one.name, k), SETTINGS.letters) for k, one in enumerate(gap.stages)])
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
@@ -169,4 +180,4 @@ def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
         far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std**2
     size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)
     best = [(i, max(drives(seen), key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
-    return sorted(best, key=lambda pair: -size[pair])[:PAIRS]
+    return sorted(best, key=lambda pair: -size[pair])[: SETTINGS.pairs]

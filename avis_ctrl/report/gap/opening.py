@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.gap.axis.result import AxisGap
@@ -13,13 +15,21 @@ from avis_ctrl.report.gap.remaining import next_step
 from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
-# Maximum number of an effect's parameters in a row; the section on parameters lists all.
-MOST = 5
 CHANCES = (
     " The probability is relative to the candidates fitted in its place, including some faults outside the library; "
     "it is at most 99 %. For hum, a converter and floor motion it is a confidence level: one minus the p-value of "
     "the test that the signal is absent."
 )
+
+
+@dataclass(frozen=True)
+class OpeningSettings:
+    """parameters : maximum number of an effect's parameters in a row; the section on parameters lists all."""
+
+    parameters: int = 5
+
+
+SETTINGS = OpeningSettings()
 
 
 def opening(found: GapFinding) -> Section:
@@ -90,7 +100,7 @@ def named(gap: Gap | AxisGap, remark: str) -> Table:
         {
             "effect": lambda one: f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",
             "place": lambda one: one.location,
-            "size": lambda one: wording.quantities(one.parameters, MOST),
+            "size": lambda one: wording.quantities(one.parameters, SETTINGS.parameters),
             "fraction of the gap": lambda one: words.percent(np.nan if one.share is None else one.share),
             "probability": lambda one: wording.probability(one.probability),
             "indistinguishable from": lambda one: ", ".join(map(wording.titled, one.indistinguishable_from)) or "none",

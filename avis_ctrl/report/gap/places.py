@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,9 +14,20 @@ from avis_ctrl.report.gap import wording
 from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, listed
 from avis_ctrl.study.gap import GapFinding
 
-# The colour scale runs from half the noise power to at least ten times the noise power.
-LOWEST, LEAST_TOP = 0.5, 10.0
-LETTERS = 20
+
+@dataclass(frozen=True)
+class MapSettings:
+    """lowest, least_top : lower end, and smallest upper end, of the colour scale relative to the noise power [1]: noise
+        alone is nearly white, and a residual little above it does not look large.
+    letters : letters of a name that fit beside the map.
+    """
+
+    lowest: float = 0.5
+    least_top: float = 10.0
+    letters: int = 20
+
+
+SETTINGS = MapSettings()
 
 
 def places(found: GapFinding) -> Section:
@@ -46,14 +58,14 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     """Residual by channel and frequency of the re-identified and the updated model, on one colour scale."""
     known = np.concatenate([heat.before.ravel(), heat.after.ravel()])
     known = known[np.isfinite(known) & (known > 0)]
-    top = float(10 ** np.ceil(np.log10(max(LEAST_TOP, known.max(initial=LEAST_TOP))) - 1e-9))
+    top = float(10 ** np.ceil(np.log10(known.max(initial=SETTINGS.least_top)) - 1e-9))
     edges, n = heat.bands_Hz, len(heat.columns)
     x = hertz(float(edges[0]), float(edges[-1]))
     y = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
 
     def panel(title: str, values: np.ndarray) -> Panel:
         z = np.asarray(values, float).T
-        return Panel(x, y, (), (), title, Heat(edges, z, "residual / noise power [-]", (LOWEST, top)))
+        return Panel(x, y, (), (), title, Heat(edges, z, "residual / noise power [-]", (SETTINGS.lowest, top)))
 
     panels = [panel("After re-identification", heat.before)]
     if named:
@@ -70,7 +82,7 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
 
 def _short(name: str) -> str:
     """A name shortened to fit beside a map."""
-    return name if len(name) <= LETTERS else f"{name[: LETTERS - 1]}…"
+    return name if len(name) <= SETTINGS.letters else f"{name[: SETTINGS.letters - 1]}…"
 
 
 def table_of(places: Sequence[Where], caption: str) -> Table:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
@@ -10,7 +12,6 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, lo
 from avis_ctrl.report.pieces import Paragraph, Piece, Section
 from avis_ctrl.report.response_panels import (
     MEASURED,
-    MOST_POINTS,
     SCATTER,
     Model,
     difference,
@@ -24,9 +25,19 @@ from avis_ctrl.report.response_panels import (
 from avis_ctrl.study.identification import Identification
 
 START, MODEL = Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
-OUTPUTS_TOGETHER = 3
-# Maximum number of points of a response in the overview.
-MOST_SMALL = 90
+
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """together : outputs in one figure, which then fills a page. small : maximum number of points of a response in the
+    overview, whose panels are small.
+    """
+
+    together: int = 3
+    small: int = 90
+
+
+SETTINGS = ResponseSettings()
 
 
 def responses(found: Identification) -> Section:
@@ -55,7 +66,7 @@ def responses(found: Identification) -> Section:
                 "note",
             )
         )
-    groups = [pairs[k : k + OUTPUTS_TOGETHER] for k in range(0, len(pairs), OUTPUTS_TOGETHER)]
+    groups = [pairs[k : k + SETTINGS.together] for k in range(0, len(pairs), SETTINGS.together)]
     pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
     pieces += [_residual(seen, pairs), _overview(seen)]
     return Section("Frequency responses", "responses", tuple(pieces))
@@ -87,7 +98,7 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
     # Phases are unwrapped relative to that of the identified model.
     shown, start = (np.rad2deg(base + np.angle(value / model)) for value in (measured, seen.start[:, i, j]))
     s = np.rad2deg(np.minimum(2 * seen.measured_std[:, i, j] / np.maximum(np.abs(measured), 1e-300), np.pi))
-    keep = thin(len(f), MOST_POINTS)
+    keep = thin(len(f))
     curves = (
         markers(f[keep], shown[keep], "measured", MEASURED),
         Curve(f, np.rad2deg(base), "identified", MODEL),
@@ -113,7 +124,7 @@ def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
-    columns, keep = drives(seen), thin(len(seen.frequency_Hz), MOST_SMALL)
+    columns, keep = drives(seen), thin(len(seen.frequency_Hz), SETTINGS.small)
     f, last = seen.frequency_Hz[keep], len(seen.outputs) - 1
     size = np.abs(np.concatenate([seen.model[:, :, columns], seen.start[:, :, columns]]))
     limits = log_limits(size, 0.7, 1.5, quantile=0.02)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.identification.validation import HeldOut
@@ -12,15 +14,23 @@ from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, l
 from avis_ctrl.study.identification import Identification
 
 BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
-# Maximum number of held-out records with individual figures; a long record is split into many pieces.
-MOST_DRAWN = 3
+
+
+@dataclass(frozen=True)
+class ValidationSettings:
+    """drawn : maximum number of held-out records with figures of their own: a long record is split into many pieces."""
+
+    drawn: int = 3
+
+
+SETTINGS = ValidationSettings()
 
 
 def validation(found: Identification) -> Section:
     """Chi-square, errors, whiteness and modes."""
     v = found.validation
     pieces: list[Piece] = [Paragraph(words.sentence(v.verdict), "verdict", v.passed), _records(found)]
-    drawn = v.held_out[:MOST_DRAWN]
+    drawn = v.held_out[: SETTINGS.drawn]
     for one in drawn:
         # The errors of the first record are in the summary.
         bars_of_errors = [] if one is drawn[0] else [errors(one, v.outputs)]

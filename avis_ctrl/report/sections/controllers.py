@@ -13,20 +13,23 @@ from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, 
 from avis_ctrl.report.pieces import Piece, Section, Table, listed
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
-HZ = np.geomspace(0.01, 500.0, 500)
-
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """poles : maximum number of poles in the table, about one page. entries : maximum number of entries of a controller
-    that are distinguishable in one diagram.
+    """poles : maximum number of poles in the table, about one page.
+    entries : maximum number of entries of a controller that are distinguishable in one diagram.
+    range_Hz, points : range of the curves [Hz], from the slowest filters to beyond the band of any loop, and number of
+        their points: about a hundred per decade show every resonance.
     """
 
     poles: int = 60
     entries: int = 9
+    range_Hz: tuple[float, float] = (0.01, 500.0)
+    points: int = 500
 
 
 SETTINGS = ControllerSettings()
+HZ = np.geomspace(*SETTINGS.range_Hz, SETTINGS.points)
 
 
 def controllers(result: DesignResult) -> Section:
@@ -86,7 +89,7 @@ def _gains(made: list[ControllerResult]) -> Figure:
     return Figure(
         "controller_gains",
         "Singular values of the controllers, from measured velocity to force: largest (thick) and smallest (thin).",
-        (Panel(hertz(0.01, 500.0), Axis("gain [N s/m]", "log"), tuple(curves)),),
+        (Panel(hertz(*SETTINGS.range_Hz), Axis("gain [N s/m]", "log"), tuple(curves)),),
     )
 
 
@@ -108,7 +111,7 @@ def _bode(result: DesignResult) -> Figure:
         coupling = np.where(np.eye(K.noutputs, dtype=bool), 0.0, np.abs(response)).max(axis=(1, 2))
         sizes.append(Curve(HZ, coupling, "largest gain between two axes", STYLES["faint"]))
         what = "the measurement of each axis to the command of the same axis, and the largest gain between two axes"
-    x = hertz(0.01, 500.0)
+    x = hertz(*SETTINGS.range_Hz)
     return Figure(
         "controller_bode",
         f"Bode plot of the mu controller: {what}; the phase is wrapped into ±180 degrees.",
@@ -134,7 +137,7 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
         loops.append(Curve(HZ, in_dB(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
         sensitivities.append(Curve(HZ, in_dB(size), c.title, controller_style(c.name)))
-    x = hertz(0.01, 500.0)
+    x = hertz(*SETTINGS.range_Hz)
     return Figure(
         "loops",
         "Largest singular value of the open loop G K at the measurement (left) and of the "

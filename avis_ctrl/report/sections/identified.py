@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +13,15 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import JUDGED_HZ, InDesign
 
-# Maximum number of parameters shown for each direction.
-SHOWN = 5
+
+@dataclass(frozen=True)
+class DirectionSettings:
+    """parameters : maximum number of parameters shown for each direction: they fill a row of the table."""
+
+    parameters: int = 5
+
+
+SETTINGS = DirectionSettings()
 
 
 def identified(result: DesignResult) -> list[Piece]:
@@ -72,9 +80,10 @@ def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str
             f"{name} {100 * change / abs(nominal[name]):+.2g} %"
             if nominal.get(name)
             else f"{name} {change:+.2g} {words.unit(units.get(name, ''))}"
-            for name, change in sizes[:SHOWN]
+            for name, change in sizes[: SETTINGS.parameters]
         ]
-        more = f" and {len(sizes) - SHOWN} parameters by less" if len(sizes) > SHOWN else ""
+        left = len(sizes) - SETTINGS.parameters
+        more = f" and {left} parameters by less" if left > 0 else ""
         rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %", ", ".join(shown) + more))
     return (
         [

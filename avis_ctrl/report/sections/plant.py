@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
@@ -28,7 +30,20 @@ ROLES = {
     "z_delta": "to Delta",
 }
 KINDS = {"real": "real", "complex": "complex scalar", "full": "complex"}
-HZ = np.geomspace(0.1, 500.0, 400)
+
+
+@dataclass(frozen=True)
+class WeightSettings:
+    """range_Hz, points : range of the curves of the weights [Hz], from below the modes of a table to beyond the band of
+    any loop, and number of their points: a hundred per decade show every resonance.
+    """
+
+    range_Hz: tuple[float, float] = (0.1, 500.0)
+    points: int = 400
+
+
+SETTINGS = WeightSettings()
+HZ = np.geomspace(*SETTINGS.range_Hz, SETTINGS.points)
 
 
 def generalized_plant(result: DesignResult) -> Section:
@@ -148,7 +163,7 @@ def _effort(result: DesignResult) -> Figure:
         "weight_effort",
         "Control effort: voltage of the drive that saturates first when a force acts along "
         "the axis, relative to floor velocity, compared with the limit of the weight; nominal plant.",
-        (Panel(hertz(0.1, 500.0), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),),
+        (Panel(hertz(*SETTINGS.range_Hz), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),),
     )
 
 
@@ -161,13 +176,13 @@ def _chains(plant: DesignPlant) -> list[Piece]:
         Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
         for k, (n, w) in enumerate(chains.items())
     ]
-    curves.append(level(0.1, 500.0, 100.0, "100 %"))
+    curves.append(level(*SETTINGS.range_Hz, 100.0, "100 %"))
     return [
         Figure(
             "weight_chains",
             "Neglected dynamics of each channel: relative uncertainty over frequency. Where it "
             "exceeds 100 %, not even the sign of the channel is known.",
-            (Panel(hertz(0.1, 500.0), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),),
+            (Panel(hertz(*SETTINGS.range_Hz), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),),
         )
     ]
 
@@ -181,14 +196,14 @@ def _noise(result: DesignResult) -> Figure:
     curves = (
         Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
         Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
-        level(0.1, 500.0, plant.floor_density, "mean floor density, unit of the noise inputs"),
+        level(*SETTINGS.range_Hz, plant.floor_density, "mean floor density, unit of the noise inputs"),
     )
     return Figure(
         "weight_noise",
         "Spectral density of the floor velocity at the site, in the band of its model, and "
         "of the noise of one sensor with its converter. Where the noise exceeds the floor motion, sensor "
         "noise dominates the signal.",
-        (Panel(hertz(0.1, 500.0), Axis("velocity [m/s/√Hz]", "log"), curves),),
+        (Panel(hertz(*SETTINGS.range_Hz), Axis("velocity [m/s/√Hz]", "log"), curves),),
     )
 
 

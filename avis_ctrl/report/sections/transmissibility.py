@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
@@ -10,7 +12,17 @@ from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, c
 from avis_ctrl.report.pieces import Section, Table, listed
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
-GAIN_DB = (-60.0, 40.0)
+
+@dataclass(frozen=True)
+class GainSettings:
+    """range_dB : range of the gain axis [dB]: down to isolation by a factor of 1000, up to the peak of a table with
+    little damping.
+    """
+
+    range_dB: tuple[float, float] = (-60.0, 40.0)
+
+
+SETTINGS = GainSettings()
 
 
 def transmissibility(result: DesignResult) -> Section:
@@ -71,7 +83,9 @@ def _hz(c: ControllerResult) -> np.ndarray:
     return c.transmissibility.omega / (2 * np.pi)
 
 
-def _panel(curves: list[Curve], bands: list[Band], title: str, ranged: tuple[float, float] = GAIN_DB) -> Panel:
+def _panel(
+    curves: list[Curve], bands: list[Band], title: str, ranged: tuple[float, float] = SETTINGS.range_dB
+) -> Panel:
     return Panel(hertz(0.1, 200.0), Axis("largest gain [dB]", "linear", ranged), tuple(curves), tuple(bands), title)
 
 
@@ -141,7 +155,9 @@ def _by_axis(result: DesignResult) -> Figure:
             if c.stable
         ]
         panels.append(
-            Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", GAIN_DB), tuple(curves), (), words.axis(axis))
+            Panel(
+                hertz(0.1, 200.0), Axis("gain [dB]", "linear", SETTINGS.range_dB), tuple(curves), (), words.axis(axis)
+            )
         )
     return Figure(
         "transmissibility_axes",
