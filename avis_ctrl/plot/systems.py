@@ -83,8 +83,9 @@ def bode(
                 bottom.plot(one.f, _phase(one.nominal[:, i, k]), **(line | {"color": colour}))
                 for H in one.samples:
                     faint = FAINT | {"color": _of_samples(colour)}
-                    top.plot(one.f, in_dB(H[:, i, k]), label=_samples_label(top, one), **faint)
+                    top.plot(one.f, in_dB(H[:, i, k]), **faint)
                     bottom.plot(one.f, _phase(H[:, i, k]), **faint)
+        _label_samples(top, one)
     finish(_in_range(top), "", "magnitude [dB]")
     finish(bottom, "frequency [Hz]", "phase [degrees]")
     low, high = bottom.get_ylim()
@@ -124,7 +125,8 @@ def sigma(
             colour = _draw(ax, one, in_dB(values[:, k]), None if k else one.label, own, True)
         for H in one.samples:
             for values in in_dB(_singular_values(H)).T:
-                ax.plot(one.f, values, label=_samples_label(ax, one), **(FAINT | {"color": _of_samples(colour)}))
+                ax.plot(one.f, values, **(FAINT | {"color": _of_samples(colour)}))
+        _label_samples(ax, one)
     return finish(_in_range(ax), "frequency [Hz]", "singular values [dB]" if several else "magnitude [dB]")
 
 
@@ -207,10 +209,11 @@ def _of_samples(colour: Any) -> Any:
     return SAMPLE if colour == NOMINAL else colour
 
 
-def _samples_label(ax: Any, one: _Curves) -> str | None:
-    """Label of the first of the random samples; several curves have samples in their own colours."""
+def _label_samples(ax: Any, one: _Curves) -> None:
+    """Label one of the random samples, which were drawn last; those of several curves have the colours of the curves."""
     words = f"{len(one.samples)} random samples" + ("" if one.alone and one.nominal[0].size == 1 else " (thin)")
-    return None if words in ax.get_legend_handles_labels()[1] else words
+    if one.samples and words not in ax.get_legend_handles_labels()[1]:
+        ax.lines[-1].set_label(words)
 
 
 def _singular_values(H: np.ndarray) -> np.ndarray:

@@ -133,7 +133,7 @@ def test_a_list_of_systems_is_drawn_over_one_another():
 def test_each_pair_of_an_uncertain_system_has_its_colour_and_one_label():
     k = real("k", 2.0, percent=20)
     top, bottom = plot.bode(matrix([[k * tf([1.0], [1.0, 1.0]), 0.0], [tf([1.0], [0.1, 1.0]), 1.0]]))
-    assert words(top) == ["y0 / u0", "y0 / u1", "y1 / u0", "y1 / u1"]
+    assert words(top) == ["y0 / u0", "y0 / u1", "y1 / u0", "y1 / u1", "20 random samples (thin)"]
     assert len({one.get_color() for one in top.lines}) == 4
     assert np.all(np.isnan(curve(bottom, 21)[1]))  # the phase of zero
 
