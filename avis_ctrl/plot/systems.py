@@ -210,7 +210,7 @@ def _of_samples(colour: Any) -> Any:
 
 
 def _label_samples(ax: Any, one: _Curves) -> None:
-    """Label one of the random samples, which were drawn last; those of several curves have the colours of the curves."""
+    """Label one of the random samples, which were drawn last; with several curves they have the curves' colours."""
     words = f"{len(one.samples)} random samples" + ("" if one.alone and one.nominal[0].size == 1 else " (thin)")
     if one.samples and words not in ax.get_legend_handles_labels()[1]:
         ax.lines[-1].set_label(words)
