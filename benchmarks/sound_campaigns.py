@@ -35,7 +35,8 @@ from avis_ctrl.rigs.floor_spectrum import realise, shipped_spectrum
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
-from avis_ctrl.simulation.campaign_data import ASSUMED_RANGE_V, RANGE_SHARE, open_loop
+from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
+from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
 from avis_ctrl.simulation.rehearsal import perturbed_truth
 from avis_ctrl.simulation.sampled_loop import SampledLoop
@@ -150,11 +151,11 @@ class _Bench:
     def level(self, u: np.ndarray, percent: float) -> np.ndarray:
         """u at a share of the largest level at which neither drives nor converter clip on the rig's file."""
         converter = self.loop.sensors.converter
-        limit = converter.limits_V[1] if converter else ASSUMED_RANGE_V
+        limit = converter.limits_V[1] if converter else CAMPAIGN.assumed_range_V
         u = u * (self.loop.limit_V / np.max(np.abs(u)))
         quiet = replace(self.loop, plant=self.rig)
         seen = np.max(np.abs(self._run(quiet, u, 0, np.zeros((len(u) + 1, 6)), 0, False, False).sensed))
-        return u * percent / 100 * min(1.0, RANGE_SHARE * limit / seen)
+        return u * percent / 100 * min(1.0, CAMPAIGN.range_share * limit / seen)
 
     def record(
         self, name: str, kind: str, u: np.ndarray, start_s: float, seed: tuple[int, ...], from_rest: bool = False

@@ -36,7 +36,7 @@ from avis_ctrl.lti.magnitude_fit import covering_fits
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, stability_bound, worst_case_gain
-from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.workers import each
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull
 from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
@@ -215,7 +215,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
         grid, _controller_error(axes, K, least, grid, settings), np.full(grid.centre.size, settings.harmless), settings
     )
     # Bounds of the table between frequencies take minutes if it has many blocks; at a few frequencies, seconds.
-    if only_stable and not (at_least := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + SLACK:
+    if only_stable and not (at_least := _gain_above_at_least(axes, K, least, W_a, settings)) < 1 + ANALYSIS.slack:
         raise StabilityNotProvedError(
             "the bound of the loop gain from half the sample rate on is at least "
             f"{at_least:.3g}; the proof needs less than 1"
@@ -241,7 +241,7 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
     low, high = (2 * np.pi * f for f in design.transmissibility.band_Hz)
     # One proof of robust stability serves all gains: the additional channels do not change the loop of the blocks.
     robust = stability_bound(motion.select(range(blocks.n_z), range(blocks.n_w)), blocks)
-    if only_stable and (largest := float(np.max(robust.upper_curve, initial=robust.lower))) >= 1 + SLACK:
+    if only_stable and (largest := float(np.max(robust.upper_curve, initial=robust.lower))) >= 1 + ANALYSIS.slack:
         raise StabilityNotProvedError(
             "mu of the uncertainty together with the sampling errors is at least "
             f"{robust.lower:.4g} and bounded by {largest:.4g} only; the proof needs less "
@@ -249,14 +249,14 @@ def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings
         )
 
     def worst(system: StateSpace, band: tuple[float, float] = below, points: int = settings.few_points) -> MuPeak:
-        return worst_case_gain(system, blocks, band=band, slack=SLACK, robust=robust, points=points)
+        return worst_case_gain(system, blocks, band=band, slack=ANALYSIS.slack, robust=robust, points=points)
 
     in_band = low, min(high, axes.half_rate)
     from_below, from_above = _between_samples(axes, errors, grid, settings)
     mu, peak, band, *between = each(
         lambda one: one(),
         [
-            lambda: mu_peak(performance, whole, band=below, slack=SLACK),
+            lambda: mu_peak(performance, whole, band=below, slack=ANALYSIS.slack),
             lambda: worst(motion, points=settings.points),
             lambda: worst(motion, in_band),
             lambda: worst(from_below),

@@ -14,7 +14,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.fixed_order import fixed_order
 from avis_ctrl.robust.mu_descent import Task
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.roll_off import gain_limit
 from avis_ctrl.uncertainty.generalized_plant import GeneralizedPlant
@@ -78,4 +78,4 @@ def with_fewer_states(
 
 def _order_and_mu(P: GeneralizedPlant, K: StateSpace) -> tuple[int, float]:
     """Number of states of K, and upper bound of mu of the design model with K."""
-    return K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=SLACK).upper
+    return K.nstates, mu_peak(P.closed(K), P.all_blocks, slack=ANALYSIS.slack).upper

@@ -8,7 +8,8 @@ velocity in the closed loop stays within
     sum over k of |C Phi^k Gamma| e,
 
 the l1 norm of the sampled linear loop: a worst-case bound, not a standard deviation. The magnitudes are those that a
-Gaussian signal exceeds once in ten minutes (`study.analysis.PEAK_FACTOR` times the r.m.s. of floor and sensor noise).
+Gaussian signal exceeds once in ten minutes (`peak_factor` of `study.analysis` times the r.m.s. of floor and sensor
+noise).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import N_Q, disturbed_period_map, gain_at_rest
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 from avis_ctrl.simulation.sampled_response import open_response
-from avis_ctrl.study.analysis import PEAK_FACTOR
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 
 
 def rounding_noise(
@@ -86,7 +87,9 @@ def _levels(loop: SampledLoop, points: int) -> tuple[np.ndarray, np.ndarray]:
     states = np.linalg.solve(np.exp(1j * omega * loop.period_s)[:, None, None] * np.eye(K.nstates) - K.A, K.B @ y)
 
     def peak(density: np.ndarray) -> np.ndarray:
-        return PEAK_FACTOR * np.sqrt(np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0))
+        return ANALYSIS.peak_factor * np.sqrt(
+            np.trapezoid(np.sum(np.abs(density) ** 2, axis=2), omega / (2 * np.pi), axis=0)
+        )
 
     # In addition the offsets of the channels, of either sign; at rest only position sensors are fed back.
     offset = np.array([one.offset_V for one in loop.rig.sensors()])

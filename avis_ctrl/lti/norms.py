@@ -8,6 +8,7 @@ imaginary eigenvalues. The peak is therefore found independently of a frequency 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +19,23 @@ from avis_ctrl.lti.bilinear import continuous_image, sampled_frequency
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.lti.statespace import StateSpace
 
-# Eigenvalues of the Hamiltonian within this angle [rad] of the imaginary axis are tried as crossings.
-NEAR_AXIS = 3e-2
-# Frequencies, as multiples of the peak frequency, that are searched once more before a peak is accepted.
-NEIGHBOURHOOD = np.geomspace(0.5, 2.0, 101)
+
+@dataclass(frozen=True)
+class NormSettings:
+    """near_axis : angle from the imaginary axis within which eigenvalues of the Hamiltonian are tried as crossings
+        [rad]. Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The
+        response is evaluated at every one of them: an extra frequency costs little, a missing one the norm.
+    beside, points : range as multiples of the peak frequency [1], and number of frequencies in it, that are searched
+        once more before a peak is accepted. If the poles span many decades, round-off can hide the crossings of a flat
+        peak.
+    """
+
+    near_axis: float = 3e-2
+    beside: tuple[float, float] = (0.5, 2.0)
+    points: int = 101
+
+
+SETTINGS = NormSettings()
 
 
 def decibels(gain: float) -> float:
@@ -91,8 +105,7 @@ def hinf_norm(system: Any, tolerance: float = 1e-6) -> PeakGain:
             points = np.concatenate([edges, (edges[:-1] + edges[1:]) / 2, np.sqrt(edges[:-1] * edges[1:])])
             new_omega, new_level = _best(system, points)
         if new_level <= (1.0 + tolerance) * level and 0 < omega < np.inf:
-            # If the poles span many decades, round-off can hide the crossings of a flat peak: search around the peak.
-            near_omega, near = _best(system, omega * NEIGHBOURHOOD)
+            near_omega, near = _best(system, omega * np.geomspace(*SETTINGS.beside, SETTINGS.points))
             if near > new_level:
                 new_omega, new_level = near_omega, near
         if new_level <= (1.0 + tolerance) * level:
@@ -187,9 +200,7 @@ def _level_crossings(system: StateSpace, level: float) -> np.ndarray:
         )
     )
     size = np.maximum(np.abs(eigenvalues), 1e-12 * np.max(np.abs(eigenvalues)))
-    # Round-off moves the crossings of a flat response far off the axis (a nearly multiple eigenvalue). The caller
-    # evaluates the response at every returned frequency: an extra frequency costs little, a missing one the norm.
-    on_axis = np.abs(eigenvalues.real) < NEAR_AXIS * size
+    on_axis = np.abs(eigenvalues.real) < SETTINGS.near_axis * size
     return np.unique(np.abs(eigenvalues[on_axis].imag))
 
 

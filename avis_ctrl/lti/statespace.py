@@ -24,10 +24,22 @@ from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
 Selector = str | int | slice | Sequence[str] | Sequence[int] | np.ndarray
-# Block size (states) of the back substitution; all work outside the diagonal blocks is matrix products.
-RESOLVENT_BLOCK = 16
-# Number of points at which a response is checked, and the largest relative difference accepted there.
-RESOLVENT_PROBES, RESOLVENT_TOLERANCE = 6, 1e-6
+
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """block : number of states of a block of the back substitution. Only the work inside the diagonal blocks is done
+        row by row, all other work is matrix products.
+    probes : number of frequencies at which a response is checked by elimination, which is slow.
+    tolerance : largest relative difference accepted there [1]: far above the round-off of a well scaled system.
+    """
+
+    block: int = 16
+    probes: int = 6
+    tolerance: float = 1e-6
+
+
+SETTINGS = ResponseSettings()
 
 
 def as_names(given: Iterable[str] | None) -> Names:
@@ -564,7 +576,7 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     T, U = la.schur(balanced, output="complex")
     response = _back_substituted(T, U.conj().T @ (B / scale[:, None]), (C * scale) @ U, points)
     order = np.argsort(np.abs(points))
-    place = np.unique(np.linspace(0, points.size - 1, RESOLVENT_PROBES).astype(int))
+    place = np.unique(np.linspace(0, points.size - 1, SETTINGS.probes).astype(int))
     probes = order[place]
     exact = _eliminated(A, B, C, points[probes])
     # At a pole both are infinite and cannot be compared.
@@ -572,7 +584,7 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     wrong = np.zeros(place.size)
     size = np.linalg.norm(exact[finite], axis=(1, 2))
     error = np.linalg.norm(response[probes[finite]] - exact[finite], axis=(1, 2))
-    wrong[finite] = ~(error <= RESOLVENT_TOLERANCE * size)
+    wrong[finite] = ~(error <= SETTINGS.tolerance * size)
     doubtful = order[np.interp(np.arange(points.size), place, wrong) > 0]
     response[doubtful] = _eliminated(A, B, C, points[doubtful])
     return response
@@ -594,8 +606,8 @@ def _back_substituted(T: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.nd
     x = np.zeros((n, points.size * columns), complex)
     pivots = np.repeat(points, columns) - np.diag(T)[:, None]
     right = np.tile(B, (1, points.size))
-    for stop in range(n, 0, -RESOLVENT_BLOCK):
-        block = slice(max(stop - RESOLVENT_BLOCK, 0), stop)
+    for stop in range(n, 0, -SETTINGS.block):
+        block = slice(max(stop - SETTINGS.block, 0), stop)
         right[block] += T[block, stop:] @ x[stop:]
         for k in range(stop - 1, block.start - 1, -1):
             x[k] = (right[k] + T[k, k + 1 : stop] @ x[k + 1 : stop]) / pivots[k]

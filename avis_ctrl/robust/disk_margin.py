@@ -14,7 +14,8 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system
-from avis_ctrl.robust.mu_peak import SLACK, MuPeak, mu_peak
+from avis_ctrl.robust.mu_peak import SETTINGS as PEAK
+from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.elements import Dynamics
@@ -62,7 +63,9 @@ class DiskMargin(Shown):
         return float(20 * np.log10(min(high, 1 / low if low > 0 else np.inf)))
 
 
-def disk_margin(L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0, slack: float = SLACK) -> DiskMargin:
+def disk_margin(
+    L: Any, K: Any = None, *, at: At = "outputs", skew: float = 0.0, slack: float = PEAK.slack
+) -> DiskMargin:
     """Disk margin of a loop with negative feedback, for all its channels at once.
 
     Parameters

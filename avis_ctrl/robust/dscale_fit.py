@@ -28,11 +28,20 @@ import scipy.sparse as sp
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.robust.scalings import ScalarScaling
 
-# Minimum of p and q relative to prod(y + |y_i|), which keeps zeros and poles away from the axis.
-POSITIVITY_MARGIN = 1e-7
-# log t / weight above which a point imposes no constraint in double precision.
-SLACK_LIMIT = 25.0
 Fitted = TypeVar("Fitted")
+
+
+@dataclass(frozen=True)
+class MagnitudeFitSettings:
+    """positivity : minimum of p and q relative to prod(y + |y_i|) [1], which keeps zeros and poles away from the axis.
+    slack : log t / weight [1] above which a point imposes no constraint in double precision.
+    """
+
+    positivity: float = 1e-7
+    slack: float = 25.0
+
+
+SETTINGS = MagnitudeFitSettings()
 
 
 @dataclass(frozen=True)
@@ -201,13 +210,13 @@ class _Feasibility:
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Coefficients of p and q, ascending in y, or None if the level is infeasible."""
         log_t_k = np.divide(log_t, self.weight, out=np.full(self.y.size, np.inf), where=self.weight > 0)
-        kept = log_t_k < SLACK_LIMIT
+        kept = log_t_k < SETTINGS.slack
         inverse_t = np.exp(-log_t_k[kept])[:, None]
         # Rows are divided by the current value of q, so that each is of order one (differential correction).
         Q = self.rows_q[kept] / self.centre[kept, None]
         P = self.rows_p[kept] * np.exp(-self.log_scaled_target[kept])[:, None] / self.centre[kept, None]
-        margin_q = POSITIVITY_MARGIN / self.centre[kept]
-        margin_p = POSITIVITY_MARGIN * np.exp(-self.log_scaled_target[kept]) / self.centre[kept]
+        margin_q = SETTINGS.positivity / self.centre[kept]
+        margin_p = SETTINGS.positivity * np.exp(-self.log_scaled_target[kept]) / self.centre[kept]
         n_p, n_q = P.shape[1], Q.shape[1]
         ones = np.ones((P.shape[0], 1))
         # T Q - P / t >= s and P - T Q / t >= s (divided by T), s maximal
@@ -247,7 +256,7 @@ def half_line_rows(y: np.ndarray, log_scale: np.ndarray, e: np.ndarray) -> tuple
 
 def half_line_coefficients(x: np.ndarray, sizes: tuple[int, int], e: np.ndarray) -> np.ndarray:
     """Coefficients of s0(y) + y s1(y) + margin, ascending, from the stacked Gram vectors."""
-    coefficients = POSITIVITY_MARGIN * e
+    coefficients = SETTINGS.positivity * e
     start = 0
     for odd, size in enumerate(sizes):
         scale = np.sqrt(e[odd::2][:size])

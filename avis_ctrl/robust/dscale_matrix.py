@@ -22,8 +22,7 @@ import scipy.sparse as sp
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, gain
 from avis_ctrl.robust.dscale_fit import (
-    POSITIVITY_MARGIN,
-    SLACK_LIMIT,
+    SETTINGS,
     basis_scale,
     bisection,
     gram_cone,
@@ -147,13 +146,13 @@ class _Feasibility:
             rows_q,
             gram_q,
             identity,
-            POSITIVITY_MARGIN * _real_vectors((W @ np.conj(np.swapaxes(W, 1, 2)))[:, None])[:, 0],
+            SETTINGS.positivity * _real_vectors((W @ np.conj(np.swapaxes(W, 1, 2)))[:, None])[:, 0],
         )
 
     def solve(self, log_t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Gram matrix of P and coefficients of q in the scaled basis, or None if the level is infeasible."""
         log_t_k = np.divide(log_t, self.weight, out=np.full(self.weight.size, np.inf), where=self.weight > 0)
-        kept = np.flatnonzero(log_t_k < SLACK_LIMIT)
+        kept = np.flatnonzero(log_t_k < SETTINGS.slack)
         inverse_t = np.exp(-log_t_k[kept])[:, None, None]
         P, cone = self.rows_P[kept], self.identity.size
         q = self.rows_q[kept][:, None, :] * self.identity[None, :, None]
@@ -161,7 +160,7 @@ class _Feasibility:
         # q I - P / t >= s I and P - q I / t >= s I
         upper = np.concatenate([inverse_t * P, -q, s], axis=2).reshape(-1, P.shape[2] + q.shape[2] + 1)
         lower = np.concatenate([-P, inverse_t * q, s], axis=2).reshape(-1, P.shape[2] + q.shape[2] + 1)
-        margin, unit = self.margin_P[kept], POSITIVITY_MARGIN * self.identity
+        margin, unit = self.margin_P[kept], SETTINGS.positivity * self.identity
         bound = np.concatenate(
             [(unit - inverse_t[:, :, 0] * margin).ravel(), (margin - inverse_t[:, :, 0] * unit).ravel()]
         )
@@ -177,7 +176,7 @@ class _Feasibility:
         i, j = triangle(gram.shape[0])
         gram[i, j] = gram[j, i] = x[:n_P] * np.where(i == j, 1.0, 1 / np.sqrt(2.0))
         return (
-            gram + POSITIVITY_MARGIN * np.eye(gram.shape[0]),
+            gram + SETTINGS.positivity * np.eye(gram.shape[0]),
             half_line_coefficients(x[n_P:-1], self.gram_q, self.e),
         )
 

@@ -23,42 +23,39 @@ from avis_ctrl.robust.dscale_fit import fit_magnitude
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
 from avis_ctrl.robust.gamma_descent import parameter_box, parameters, with_parameters
 from avis_ctrl.robust.mu_upper import upper_bound
-from avis_ctrl.robust.scalings import MAX_ORDER, MatrixScaling, Part, ScalarScaling, Scalings
+from avis_ctrl.robust.scalings import SETTINGS as SCALINGS
+from avis_ctrl.robust.scalings import MatrixScaling, Part, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Single fits are not optimised beyond these tolerances, because all fits are refined jointly afterwards.
-FIT_TOLERANCE = 2e-2
-MATRIX_FIT_TOLERANCE = 2e-2
-# Refinement ends when a linear program predicts a smaller gain than this: a tenth of the allowed cost of a fit.
-REFINEMENT = 1e-3
-# Below this fraction of the peak any misfit is harmless; above it, mu itself is the reference. Steps with a large gain
-# need little of the mu profile; the last steps depend on it.
-BROAD_FLOOR, DETAILED_FLOOR = 0.5, 0.3
-# Number of points of the check between grid points, and the ratio to the peak above which they are added to the grid.
-CHECKED_POINTS = 400
-BETWEEN = 1.02
-
 
 @dataclass(frozen=True)
-class GroupSettings:
-    """groups : with many blocks, number of groups of blocks with shared roots, grouped by the similarity of their best
-    scalings over frequency: one root per block would add more states than the plant has. The gains are not shared."""
+class DStepSettings:
+    """All values without unit.
 
+    fit : accuracy of log |d| in the fit of a single block: all fits are refined jointly afterwards.
+    refinement : the joint refinement ends when a linear program predicts a smaller gain in log mu: a tenth of the
+        allowed cost of a fit.
+    broad_floor, detailed_floor : fraction of the peak of mu below which any misfit is harmless; above it, mu itself is
+        the reference. Steps with a large gain need little of the mu profile; the last steps depend on it.
+    checked : number of frequencies of the check between grid points: about three times those of the largest grid.
+    between : ratio to the peak above which a peak between grid points is added to the grid.
+    groups : with many blocks, number of groups of blocks with shared roots, grouped by the similarity of their best
+        scalings over frequency: one root per block would add more states than the plant has. The gains are not shared.
+    equal_orders : orders of the scalings with equal order in all blocks. Fits of higher order follow details of the
+        best scalings at single frequencies, which are not unique.
+    """
+
+    fit: float = 2e-2
+    refinement: float = 1e-3
+    broad_floor: float = 0.5
+    detailed_floor: float = 0.3
+    checked: int = 400
+    between: float = 1.02
     groups: int = 4
+    equal_orders: tuple[int, ...] = (1, 2, 3, 4, 5)
 
 
-GROUPS = GroupSettings()
-
-
-@dataclass(frozen=True)
-class EqualOrderSettings:
-    """orders : orders of the scalings with equal order in all blocks. Fits of higher order follow details of the best
-    scalings at single frequencies, which are not unique."""
-
-    orders: tuple[int, ...] = (1, 2, 3, 4, 5)
-
-
-EQUAL_ORDER = EqualOrderSettings()
+SETTINGS = DStepSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +72,7 @@ class PointwiseScalings:
     mu: np.ndarray
     log_d: np.ndarray
     X: dict[int, np.ndarray]
-    floor: float = BROAD_FLOOR
+    floor: float = SETTINGS.broad_floor
 
     @property
     def peak(self) -> float:
@@ -140,7 +137,7 @@ def equal_order_fits(points: PointwiseScalings, max_states: int) -> Iterator[DSt
     start = _constants(points)
     everywhere = np.ones((points.omega.size, len(start.parts)))
     weights = (everywhere, everywhere * _closeness(points)[:, None], _sensitivities(points, start))
-    for order in EQUAL_ORDER.orders:
+    for order in SETTINGS.equal_orders:
         for weight in weights:
             scalings = start
             for blocks in start.members:
@@ -155,7 +152,7 @@ def d_steps(
     points: PointwiseScalings,
     loop: StateSpace,
     start: Scalings,
-    floors: Sequence[float] = (BROAD_FLOOR,),
+    floors: Sequence[float] = (SETTINGS.broad_floor,),
     allowed_cost: float = 0.01,
     max_states: int = 60,
 ) -> Iterator[DStep]:
@@ -187,7 +184,7 @@ def _settled(
     points: PointwiseScalings, loop: StateSpace, step: DStep, start: Scalings, allowed_cost: float, max_states: int
 ) -> DStep:
     """The step corrected until there are no peaks between grid points, or `start` if that costs less."""
-    dense = np.geomspace(points.omega[0], points.omega[-1], CHECKED_POINTS)
+    dense = np.geomspace(points.omega[0], points.omega[-1], SETTINGS.checked)
     response = loop.frequency_response(dense)
     first = _measured(points, loop, dense, response, start)[0]
     for _ in range(4):
@@ -213,7 +210,7 @@ def _measured(
     M = np.concatenate([response, loop.frequency_response(roots)])[order]
     omega = omega[order]
     sigma = _sigma(omega, M, scalings)
-    top = (sigma[1:-1] >= sigma[:-2]) & (sigma[1:-1] > sigma[2:]) & (sigma[1:-1] > BETWEEN * step.peak)
+    top = (sigma[1:-1] >= sigma[:-2]) & (sigma[1:-1] > sigma[2:]) & (sigma[1:-1] > SETTINGS.between * step.peak)
     at = np.flatnonzero(top) + 1
     at = at[np.argsort(sigma[at])[::-1][:4]]
     reference = np.interp(np.log(omega), np.log(points.omega), points.reference)
@@ -282,7 +279,7 @@ def _constants(points: PointwiseScalings) -> Scalings:
     parts = list(Scalings.identity(points.structure).parts)
     for k in range(len(parts) - 1):
         if k in points.X:
-            parts[k] = fit_hermitian(points.omega, points.shape(k), 0, weight, MATRIX_FIT_TOLERANCE).scaling
+            parts[k] = fit_hermitian(points.omega, points.shape(k), 0, weight, SETTINGS.fit).scaling
         d = fit_magnitude(points.omega, np.exp(points.log_d[:, k]), 0, weight).scaling
         parts[k] = parts[k].with_scalar(d)
     return Scalings(points.structure, tuple(parts), _groups(points))
@@ -296,7 +293,7 @@ def _groups(points: PointwiseScalings) -> tuple[int, ...]:
     weight = _closeness(points)[:, None]
     course = points.log_d[:, :n] - np.average(points.log_d[:, :n], axis=0, weights=weight[:, 0])
     tree = hierarchy.linkage((np.sqrt(weight) * course).T, "ward")
-    return (*hierarchy.fcluster(tree, GROUPS.groups, "maxclust").tolist(), 0)
+    return (*hierarchy.fcluster(tree, SETTINGS.groups, "maxclust").tolist(), 0)
 
 
 def _raised(
@@ -315,13 +312,13 @@ def _raised(
         part = scalings.parts[k]
         if matrices and isinstance(part, MatrixScaling):
             order = part.order // points.structure.blocks[k].rows + by
-            if order > MAX_ORDER // 2:
+            if order > SCALINGS.max_order // 2:
                 return None
             weight = _sensitivities(points, step.scalings)[:, k]
-            part = fit_hermitian(points.omega, points.X[k], order, weight, MATRIX_FIT_TOLERANCE).scaling
+            part = fit_hermitian(points.omega, points.X[k], order, weight, SETTINGS.fit).scaling
         else:
             order = part.scalar.order + by
-            if order > MAX_ORDER:
+            if order > SCALINGS.max_order:
                 return None
             # Sensitivities with the groups that are already refitted.
             weights = _sensitivities(points, scalings)
@@ -347,7 +344,7 @@ def _fitted(
     # Each block has its own gain; the remaining dependence on frequency is common to the group.
     own = np.average(target, axis=0, weights=weights) if len(blocks) > 1 else np.zeros(1)
     common = np.average(target - own, axis=1, weights=weights)
-    fit = fit_magnitude(points.omega, np.exp(common), order, np.max(weights, axis=1), FIT_TOLERANCE)
+    fit = fit_magnitude(points.omega, np.exp(common), order, np.max(weights, axis=1), SETTINGS.fit)
     theta = fit.scaling.within(band_of(points.omega)).theta
     return [
         scalings.parts[k].with_scalar(ScalarScaling(np.r_[theta[0] + gain, theta[1:]]))
@@ -412,7 +409,7 @@ def _refined(points: PointwiseScalings, scalings: Scalings, steps: int = 5) -> S
         move, predicted = _trust_step(
             values, slopes, np.maximum(box[:, 0] - theta, -radius), np.minimum(box[:, 1] - theta, radius)
         )
-        if level - predicted < REFINEMENT or radius < 1e-3:
+        if level - predicted < SETTINGS.refinement or radius < 1e-3:
             break
         trial = with_parameters(scalings, theta + move)
         new_values, new_slopes = _linearised(points, trial)

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from avis_ctrl.lti import StateSpace
 
-POINTS_PER_DECADE = 5
-MAX_POINTS = 140
+
+@dataclass(frozen=True)
+class GridSettings:
+    """points_per_decade : number of evenly spaced frequencies: enough between the resonances, which are added to them.
+    most_points : largest number of frequencies of a grid: the time of a D-step grows with it.
+    """
+
+    points_per_decade: int = 5
+    most_points: int = 140
+
+
+SETTINGS = GridSettings()
 
 
 def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
@@ -26,7 +38,7 @@ def frequency_grid(system: StateSpace, change: float = 1e-3) -> np.ndarray:
     first = max(int(np.argmax(from_start)) - 1, 0)
     last = min(wide.size - int(np.argmax(from_end[::-1])), wide.size - 1)
     low, high = wide[min(first, last - 1)], wide[max(last, first + 1)]
-    even = np.geomspace(low, high, max(30, round(POINTS_PER_DECADE * np.log10(high / low))))
+    even = np.geomspace(low, high, max(30, round(SETTINGS.points_per_decade * np.log10(high / low))))
     # Another decade on either side makes the scalings constant where the loop is already constant.
     ends = np.concatenate([low / np.array([10.0, 3.0]), high * np.array([3.0, 10.0])])
     return merged(np.concatenate([even, ends]), resonances(poles, low, high))
@@ -41,17 +53,18 @@ def resonances(poles: np.ndarray, low: float = 0.0, high: float = np.inf, dampin
 
 
 def merged(omega: np.ndarray, extra: np.ndarray) -> np.ndarray:
-    """Sorted union without points closer than 0.1 %, thinned to at most MAX_POINTS."""
+    """Sorted union without points closer than 0.1 %, thinned to at most `SETTINGS.most_points`."""
     every = np.sort(np.concatenate([omega, extra]))
     kept = every[np.concatenate([[True], every[1:] > every[:-1] * np.exp(1e-3)])]
-    return kept if kept.size <= MAX_POINTS else kept[np.unique(np.linspace(0, kept.size - 1, MAX_POINTS).astype(int))]
+    most = SETTINGS.most_points
+    return kept if kept.size <= most else kept[np.unique(np.linspace(0, kept.size - 1, most).astype(int))]
 
 
 def refined_grid(omega: np.ndarray, mu: np.ndarray, peaks: int = 4) -> np.ndarray:
-    """The grid with additional points halfway to both neighbours of its highest local maxima, up to MAX_POINTS."""
+    """The grid with additional points halfway to both neighbours of its highest local maxima, if they fit."""
     inner = np.flatnonzero((mu[1:-1] >= mu[:-2]) & (mu[1:-1] >= mu[2:])) + 1
     highest = inner[np.argsort(mu[inner])[::-1][:peaks]]
-    if omega.size + 2 * highest.size > MAX_POINTS:
+    if omega.size + 2 * highest.size > SETTINGS.most_points:
         return omega
     halfway = [np.sqrt(omega[highest] * omega[highest + side]) for side in (-1, 1)]
     return merged(omega, np.concatenate(halfway))

@@ -24,13 +24,30 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, normal_form, rank_margins, regularised
 from avis_ctrl.robust.hinf_riccati import GammaBracket, control_riccati, filter_riccati, find_gamma, gamma_test
-from avis_ctrl.robust.hinf_settings import SETTINGS
-from avis_ctrl.robust.scalings import MAX_ORDER, ScalarScaling, Scalings
+from avis_ctrl.robust.hinf_settings import SETTINGS as HINF
+from avis_ctrl.robust.scalings import SETTINGS as SCALINGS
+from avis_ctrl.robust.scalings import ScalarScaling, Scalings
 
 COUPLED = "rho(X Y)"
-STEP = 1e-6
-GAMMA_TOLERANCE = 1e-5
-REGULARISATION = 1e-4
+
+
+@dataclass(frozen=True)
+class GradientSettings:
+    """All values without unit.
+
+    step : change of a parameter (of gamma: relative) by which the data of the Riccati equations are differentiated:
+        their error is of its order, and its round-off is far smaller.
+    gamma : relative accuracy of gamma, small compared with the gain at which the descent ends.
+    regularisation : size of the extra outputs or inputs of a plant whose D12 or D21 is rank deficient, relative to its
+        channels: small compared with the weights, large compared with round-off.
+    """
+
+    step: float = 1e-6
+    gamma: float = 1e-5
+    regularisation: float = 1e-4
+
+
+SETTINGS = GradientSettings()
 
 
 @dataclass(frozen=True)
@@ -46,7 +63,7 @@ class ScaledProblem:
     def of(P: StateSpace, nmeas: int, ncon: int) -> ScaledProblem:
         """The problem of P; nmeas, ncon : number of measurements and controls, which are last."""
         of_u, of_y = rank_margins(Plant.of(P, nmeas, ncon))
-        return ScaledProblem(balance(P), nmeas, ncon, (of_u < SETTINGS.rank_tolerance, of_y < SETTINGS.rank_tolerance))
+        return ScaledProblem(balance(P), nmeas, ncon, (of_u < HINF.rank_tolerance, of_y < HINF.rank_tolerance))
 
     def normal(self, scalings: Scalings) -> NormalForm:
         """Normal form of the scaled plant, with extra channels if D12 or D21 is rank deficient."""
@@ -65,7 +82,9 @@ class ScaledProblem:
             S.inputs[w:],
             S.outputs[z:],
         )
-        return normal_form(regularised(plant, REGULARISATION, *self.singular, False) if any(self.singular) else plant)
+        return normal_form(
+            regularised(plant, SETTINGS.regularisation, *self.singular, False) if any(self.singular) else plant
+        )
 
     def reaches(self, scalings: Scalings, gamma: float) -> bool:
         """Whether some controller achieves a scaled norm below gamma."""
@@ -97,16 +116,16 @@ def gamma_and_gradient(
     gradient = np.empty(theta.size)
     for k in range(theta.size):
         moved = theta.copy()
-        moved[k] += STEP
+        moved[k] += SETTINGS.step
         shift = problem.normal(with_parameters(scalings, moved)).plant
-        gradient[k] = -slope.along(shift, gamma) / STEP / of_gamma
+        gradient[k] = -slope.along(shift, gamma) / SETTINGS.step / of_gamma
     return gamma, gradient / gamma
 
 
 def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) -> tuple[_CouplingSlope, float, float]:
     """Derivatives of rho(X Y) at the optimum, gamma there, and the derivative of rho(X Y) - gamma^2 by gamma."""
     plant = problem.normal(scalings).plant
-    bracket = find_gamma(plant, GAMMA_TOLERANCE, hint)
+    bracket = find_gamma(plant, SETTINGS.gamma, hint)
     if COUPLED not in bracket.limited_by:
         raise ComputationError(
             "gamma has no gradient here",
@@ -116,7 +135,8 @@ def _coupling(problem: ScaledProblem, scalings: Scalings, hint: float | None) ->
         )
     gamma = bracket.upper.gamma
     slope = _CouplingSlope.of(plant, bracket)
-    return slope, gamma, slope.along(plant, gamma * (1 + STEP)) / (gamma * STEP) - 2 * slope.rho / gamma
+    step = SETTINGS.step
+    return slope, gamma, slope.along(plant, gamma * (1 + step)) / (gamma * step) - 2 * slope.rho / gamma
 
 
 @dataclass(frozen=True)
@@ -255,7 +275,7 @@ def with_added_pairs(
     free = [
         group
         for group in scalings.members
-        if scalings.parts[group[0]].scalar.order < MAX_ORDER
+        if scalings.parts[group[0]].scalar.order < SCALINGS.max_order
         and sum(blocks[k].rows + blocks[k].cols for k in group) <= room
     ]
     if not free:
@@ -300,8 +320,8 @@ def _neutral_slopes(
         moved = base
         for k in group:
             part = scalings.parts[k]
-            moved = moved.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, STEP)))
-        result[at] = -slope.along(problem.normal(moved).plant, gamma) / STEP / of_gamma / gamma
+            moved = moved.replace(k, part.with_scalar(part.scalar.with_neutral_pair(place, SETTINGS.step)))
+        result[at] = -slope.along(problem.normal(moved).plant, gamma) / SETTINGS.step / of_gamma / gamma
     return result
 
 

@@ -23,7 +23,7 @@ from avis_ctrl.lti import StateSpace, balance, lft_lower
 from avis_ctrl.lti.norms import norm_is_below
 from avis_ctrl.robust.hinf_plant import NormalForm, Plant, pointwise
 from avis_ctrl.robust.hinf_settings import SETTINGS
-from avis_ctrl.robust.riccati import ROUND_OFF, refined_balanced, solve_riccati
+from avis_ctrl.robust.riccati import refined_balanced, solve_riccati
 
 IN_DOUBT = "the Riccati test is undecided and its controller does not reach this gamma"
 
@@ -362,13 +362,13 @@ def rounding(P: Plant, gamma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray
     solved = inverse @ (terms @ np.abs(np.linalg.solve(R, np.hstack([D1.T @ P.C1, np.hstack([P.B1, P.B2]).T]))) + right)
     K, G = solved[:, : P.n], solved[:, P.n :]
     size = np.abs(P.A) + B @ K, B @ G, c.T @ c + c.T @ d @ K
-    return tuple(ROUND_OFF * one for one in size)
+    return tuple(SETTINGS.round_off * one for one in size)
 
 
 def _difference(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """a - b c with entries that are pure round-off set to zero, because balancing would treat them as couplings."""
     result = a - b @ c
-    noise = 8 * np.finfo(float).eps * (np.abs(a) + np.abs(b) @ np.abs(c))
+    noise = SETTINGS.round_off * (np.abs(a) + np.abs(b) @ np.abs(c))
     return np.where(np.abs(result) <= noise, 0.0, result)
 
 

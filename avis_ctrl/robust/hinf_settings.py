@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 
 @dataclass(frozen=True)
 class HinfSettings:
@@ -20,6 +22,8 @@ class HinfSettings:
     known_direction : largest relative error of the directions in which a control acts, or which a measurement detects,
         at one frequency; with a larger error the response there gives no bound. A direction never counts as lost
         because its gain is small: a control that has rolled off still acts, and a lost direction raises the bound.
+    round_off : round-off of the data of a Riccati equation, or of its residual, relative to the sum of the magnitudes
+        of its terms: a few rounding errors.
     response_tolerance : largest relative difference of two responses off the imaginary axis that counts as round-off.
     axis_tolerance : real part of a Hamiltonian eigenvalue, relative to its magnitude, up to which it counts as lying on
         the imaginary axis: its round-off.
@@ -48,6 +52,7 @@ class HinfSettings:
     no_column: float = 1e-12
     rank_at_zero: float = 1e-9
     known_direction: float = 1e-6
+    round_off: float = 8 * float(np.finfo(float).eps)
     response_tolerance: float = 1e-9
     axis_tolerance: float = 1e-10
     lagrangian_tolerance: float = 1e-6

@@ -29,10 +29,23 @@ from avis_ctrl.robust.mu_upper import bound_for_goal
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Interval = tuple[float, float]
-NARROW = 1e-6
-# This number of gaps at one level means that mu is flat: a slightly higher level needs far fewer intervals.
-PATIENCE = 250
-WIDENINGS = 5
+
+
+@dataclass(frozen=True)
+class IntervalSettings:
+    """narrow : width of a gap relative to its frequency [1] below which it is not halved again, since the response is
+        constant in it.
+    patience : number of gaps at one level from which mu counts as flat: a slightly higher level needs far fewer
+        intervals.
+    widenings : how often the level is raised for that reason: by 31 times the slack in all.
+    """
+
+    narrow: float = 1e-6
+    patience: int = 250
+    widenings: int = 5
+
+
+SETTINGS = IntervalSettings()
 
 
 def midpoint(low: float, high: float) -> float:
@@ -149,7 +162,7 @@ def cover(
         state.looked += len(state.gaps)
         if not state.gaps or total > most or not np.isfinite(state.level):
             break
-        if state.looked > PATIENCE and state.widened < WIDENINGS:
+        if state.looked > SETTINGS.patience and state.widened < SETTINGS.widenings:
             state.level *= 1 + slack * 2.0**state.widened
             state.looked, state.widened = 0, state.widened + 1
         _one_round(N, structure, scaled, bound, state, slack)
@@ -227,7 +240,7 @@ def accuracy_of(slack: float) -> float:
 
 def _is_narrow(gap: Interval) -> bool:
     # A gap that ends at 0 or infinity is halved (doubled) until the response there has settled.
-    return np.isfinite(gap[1]) and gap[1] - gap[0] <= NARROW * gap[1]
+    return np.isfinite(gap[1]) and gap[1] - gap[0] <= SETTINGS.narrow * gap[1]
 
 
 def _without(gap: Interval, parts: list[Interval]) -> list[Interval]:

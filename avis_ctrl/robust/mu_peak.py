@@ -25,43 +25,38 @@ from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
 from avis_ctrl.robust.mu_lmi import Array
-from avis_ctrl.robust.mu_lower import SETTINGS, MuLowerBound, lower_bound, singular_frequency
+from avis_ctrl.robust.mu_lower import SETTINGS as LOWER
+from avis_ctrl.robust.mu_lower import MuLowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, bound_of_peak, skewed_upper_bound, upper_bound
 from avis_ctrl.robust.one_thread import one_thread
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
-SLACK = 5e-4
-KNOWN_SLACK = 5e-3
 ALL_FREQUENCIES: Interval = (0.0, np.inf)
 
 
 @dataclass(frozen=True)
-class CurveSettings:
-    """points : number of evenly chosen frequencies of a curve if its bounds take long: enough for a plot.
+class PeakSettings:
+    """slack : relative amount [1] by which the level to be proved exceeds the highest value found: three digits of mu.
+    known_slack : a bound that the caller has proved replaces the proof if it exceeds this level by a smaller fraction
+        [1]: a proof takes long and would gain less.
+    points : number of evenly chosen frequencies of a curve if its bounds take long: enough for a plot.
     highest : number of highest values whose frequencies are added; the peak is refined from these.
-    """
-
-    points: int = 40
-    highest: int = 4
-
-
-CURVES = CurveSettings()
-
-
-@dataclass(frozen=True)
-class StabilitySettings:
-    """round_off : relative change of A [1] that counts as round-off: a few rounding errors of the eigenvalues.
+    round_off : relative change of A [1] that counts as round-off: a few rounding errors of the eigenvalues.
     near : distance of a pole from the limit of stability, over the norm of A [1], below which this is tested. Round-off
         moves a double pole by its square root (1e-8), a triple pole by its cube root (1e-5).
     """
 
+    slack: float = 5e-4
+    known_slack: float = 5e-3
+    points: int = 40
+    highest: int = 4
     round_off: float = 1e-15
     near: float = 1e-5
 
 
-STABILITY = StabilitySettings()
+SETTINGS = PeakSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,7 +117,7 @@ def mu_peak(
     *,
     band: Interval = ALL_FREQUENCIES,
     known_upper: float | None = None,
-    slack: float = SLACK,
+    slack: float = SETTINGS.slack,
 ) -> MuPeak:
     """Supremum of mu(N(j omega)) over a band, by default all frequencies including 0 and infinity.
 
@@ -168,9 +163,9 @@ def worst_case_gain(
     blocks: BlockStructure | Sequence[Block],
     *,
     band: Interval = ALL_FREQUENCIES,
-    slack: float = SLACK,
+    slack: float = SETTINGS.slack,
     robust: Stability | None = None,
-    points: int = CURVES.points,
+    points: int = SETTINGS.points,
 ) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
 
@@ -216,7 +211,7 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
     ------
     InputError, ComputationError : as in mu_peak.
     """
-    system, structure = _checked(N, blocks, SLACK)
+    system, structure = _checked(N, blocks, SETTINGS.slack)
     with one_thread():
         part = _prepared(system, structure)
         done = _stable_cover(part.N, part.structure)
@@ -225,7 +220,7 @@ def stability_bound(N: StateSpace, blocks: BlockStructure | Sequence[Block]) -> 
             return MuPeak(
                 done.level, 0.0, 0.0, None, True, _in_words(done, ALL_FREQUENCIES, system.dt), none, none, none
             )
-        return _in_rad_s(system, part, _mu_peak(part.N, part.structure, ALL_FREQUENCIES, SLACK, dt=system.dt))
+        return _in_rad_s(system, part, _mu_peak(part.N, part.structure, ALL_FREQUENCIES, SETTINGS.slack, dt=system.dt))
 
 
 def _checked(
@@ -262,10 +257,10 @@ def _not_stable(N: StateSpace) -> complex | None:
         return complex(poles[worst])
     A = la.matrix_balance(N.A, permute=False)[0]
     size = np.linalg.norm(A, 2)
-    close = poles[(growth >= -STABILITY.near * size) & (poles.imag >= 0)]
+    close = poles[(growth >= -SETTINGS.near * size) & (poles.imag >= 0)]
     points = close / np.abs(close) if N.dt else 1j * close.imag
     distances = np.linalg.svd(points[:, None, None] * np.eye(N.nstates) - A, compute_uv=False)[:, -1]
-    doubtful = close[distances <= STABILITY.round_off * size]
+    doubtful = close[distances <= SETTINGS.round_off * size]
     return complex(doubtful[np.argmax(doubtful.real)]) if doubtful.size else None
 
 
@@ -317,7 +312,7 @@ class _Scan:
         including those of the highest values."""
         if not structure.many:
             return self
-        kept = _thinned(self.bound.beta, CURVES.points)
+        kept = _thinned(self.bound.beta, SETTINGS.points)
         return _Scan(self.omega[kept], self.bound.at(kept), self.slack)
 
     @property
@@ -350,7 +345,7 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
 def _thinned(values: Array, most: int) -> Array:
     """Indices of at most `most` evenly spaced values, and of the largest values."""
     even = np.linspace(0, values.size - 1, min(most, values.size)).round().astype(int)
-    return np.union1d(even, np.argsort(values)[-CURVES.highest :])
+    return np.union1d(even, np.argsort(values)[-SETTINGS.highest :])
 
 
 def _level(bounds: Array, slack: float) -> float:
@@ -372,7 +367,7 @@ def _mu_peak(
     scan = _Scan.of(N, structure, band, slack).shown(structure)
     # One stage is enough for the curve; the search continues at the peaks only.
     lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
-    if known_upper is not None and known_upper <= (1 + KNOWN_SLACK) * scan.level:
+    if known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * scan.level:
         done = Cover(known_upper)
     else:
         done = _cover_mu(N, structure, scan.level, band, scan.peak, accuracy, slack)
@@ -425,7 +420,7 @@ def _best_singular(
         moved = singular_frequency(N, structure, near, done.level, band)
         if moved is not None and moved[0] > best:
             best, at, delta = moved
-    noise = SETTINGS.round_off * float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
+    noise = LOWER.round_off * float(np.max(np.linalg.norm(N.frequency_response(omega), 2, axis=(1, 2))))
     return (best, at, delta) if best > noise else (0.0, at, None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,7 +13,16 @@ from avis_ctrl.lti.bilinear import image_frequency, sampled_image
 from avis_ctrl.robust.mu_lmi import Array
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 
-REAL = 1e-7
+
+@dataclass(frozen=True)
+class DeltaSettings:
+    """real : imaginary part relative to the size [1] up to which a number counts as real, its round-off: the pole of an
+    all-pass system would go to zero or infinity with it."""
+
+    real: float = 1e-7
+
+
+SETTINGS = DeltaSettings()
 
 
 def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[Block], dt: float = 0.0) -> StateSpace:
@@ -54,7 +64,7 @@ def realise_delta(delta: Array, omega: float, blocks: BlockStructure | Sequence[
 def _all_pass(value: complex, omega: float) -> StateSpace:
     """+-|value| (s - a)/(s + a), equal to value at s = j omega."""
     size, angle = abs(value), float(np.angle(value))
-    if abs(value.imag) <= REAL * size:
+    if abs(value.imag) <= SETTINGS.real * size:
         return gain(value.real)
     if not 0 < omega < np.inf:
         raise ComputationError(

@@ -39,9 +39,19 @@ from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure
 from avis_ctrl.uncertainty.uncertain_system import UncertainSystem
 
-# Largest relative difference between the certificate and mu of the final loop that is accepted.
-TIGHT = 0.003
-NORM_TOLERANCE = 1e-6
+
+@dataclass(frozen=True)
+class CertificateSettings:
+    """tight : largest relative difference between the certificate and mu of the final loop that is accepted [1]: less
+        than what a step of the D-K iteration has to gain.
+    norm : relative accuracy of the norm in the certificate [1]; it is added to the norm, hence far below `tight`.
+    """
+
+    tight: float = 0.003
+    norm: float = 1e-6
+
+
+SETTINGS = CertificateSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -311,17 +321,18 @@ def _options(
 def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scalings, float]:
     """Realised scalings that bound mu of a loop (the image of a sampled loop) at every frequency, and the bound.
 
-    These are the scalings of the K-step, or tightened ones if the former bound exceeds mu on the grid by over `TIGHT`.
+    These are the scalings of the K-step, or tightened ones if the former bound exceeds mu on the grid by over
+    `SETTINGS.tight`.
     """
 
     def bound(scalings: Scalings) -> float:
-        return hinf_norm(scalings.scale(closed), NORM_TOLERANCE).gain * (1 + NORM_TOLERANCE)
+        return hinf_norm(scalings.scale(closed), SETTINGS.norm).gain * (1 + SETTINGS.norm)
 
     candidates = [(best.scalings, bound(best.scalings))]
-    if candidates[0][1] > (1 + TIGHT) * best.mu:
+    if candidates[0][1] > (1 + SETTINGS.tight) * best.mu:
         omega = frequency_grid(closed)
         points = PointwiseScalings.of(omega, closed.frequency_response(omega), problem.structure)
-        tighter = tightened(points, closed, best.scalings, TIGHT, 10 * problem.P.nstates).scalings
+        tighter = tightened(points, closed, best.scalings, SETTINGS.tight, 10 * problem.P.nstates).scalings
         candidates.append((tighter, bound(tighter)))
     return min(candidates, key=lambda pair: pair[1])
 

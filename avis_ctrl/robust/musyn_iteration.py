@@ -23,7 +23,8 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
-from avis_ctrl.robust.dstep import BROAD_FLOOR, DETAILED_FLOOR, PointwiseScalings, band_of, d_steps, equal_order_fits
+from avis_ctrl.robust.dstep import SETTINGS as D_STEP
+from avis_ctrl.robust.dstep import PointwiseScalings, band_of, d_steps, equal_order_fits
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
 from avis_ctrl.robust.gamma_descent import ScaledProblem, descend, with_added_pairs
 from avis_ctrl.robust.hinfsyn import Synthesis, hinf_controller
@@ -283,13 +284,13 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
             yield found
         return
     if state.phase == "D-K":
-        floors = (BROAD_FLOOR, DETAILED_FLOOR) if _falls_fast(state) else (DETAILED_FLOOR, BROAD_FLOOR)
+        floors = D_STEP.broad_floor, D_STEP.detailed_floor
         try:
             for step in d_steps(
                 state.points,
                 lft_lower(problem.P, state.last.K),
                 state.last.scalings,
-                floors,
+                floors if _falls_fast(state) else floors[::-1],
                 max_states=options.max_added_states,
             ):
                 yield Proposal(step.scalings, step.cost, "D-K")

@@ -11,7 +11,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, lft_lower
-from avis_ctrl.robust.dstep import BETWEEN, PointwiseScalings
+from avis_ctrl.robust.dstep import SETTINGS, PointwiseScalings
 from avis_ctrl.robust.frequency_grid import resonances
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.scalings import Scalings
@@ -166,7 +166,7 @@ def analysed(
     """
     closed = lft_lower(P, K)
     points = PointwiseScalings.of(omega, closed.frequency_response(omega), structure)
-    level, extra = BETWEEN * points.peak, np.setdiff1d(resonances(closed.poles()), omega)
+    level, extra = SETTINGS.between * points.peak, np.setdiff1d(resonances(closed.poles()), omega)
     if gamma > level and extra.size:
         M = closed.frequency_response(extra)
         missed = upper_bound(M[:, None], structure, goal=level).beta > level

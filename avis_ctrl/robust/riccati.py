@@ -30,8 +30,6 @@ import scipy.linalg as la
 from avis_ctrl.lti.norms import symplectic_scale
 from avis_ctrl.robust.hinf_settings import SETTINGS
 
-# Round-off of the residual, relative to the sum of the magnitudes of its terms.
-ROUND_OFF = 8 * np.finfo(float).eps
 INACCURATE = "the Hamiltonian is too badly conditioned for its stable subspace"
 ON_AXIS = "the Hamiltonian has eigenvalues on the imaginary axis"
 
@@ -138,7 +136,7 @@ def _residual(A: np.ndarray, R: np.ndarray, Q: np.ndarray, X: np.ndarray) -> tup
     a, r, x = np.abs(A), np.abs(R), np.abs(X)
     product = A.T @ X
     size = a.T @ x
-    return product + product.T + X @ R @ X + Q, ROUND_OFF * (size + size.T + x @ r @ x + np.abs(Q))
+    return product + product.T + X @ R @ X + Q, SETTINGS.round_off * (size + size.T + x @ r @ x + np.abs(Q))
 
 
 def _error(closed: np.ndarray, size: np.ndarray) -> np.ndarray | None:

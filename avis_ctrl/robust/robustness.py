@@ -18,7 +18,7 @@ from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_fr
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust import mu_peak as peaks
-from avis_ctrl.robust.mu_peak import ALL_FREQUENCIES, SLACK, MuPeak, mu_peak
+from avis_ctrl.robust.mu_peak import ALL_FREQUENCIES, MuPeak, mu_peak
 from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.blocks import Block, BlockStructure, ComplexFull, ComplexScalar
@@ -86,7 +86,7 @@ SETTINGS = RobustnessSettings()
 
 
 def robust_stability(
-    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
+    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = peaks.SETTINGS.slack
 ) -> Robustness:
     """Size of the uncertainty, relative to the declared uncertainty, up to which a loop is stable.
 
@@ -117,7 +117,7 @@ def robust_stability(
 
 
 def robust_performance(
-    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = SLACK
+    system: Any, blocks: BlockStructure | Sequence[Block] | None = None, *, slack: float = peaks.SETTINGS.slack
 ) -> Robustness:
     """Largest a for which the gain from d to e is at most 1/a with a times the declared uncertainty.
 
@@ -146,7 +146,7 @@ def worst_case_gain(
     blocks: BlockStructure | Sequence[Block] | None = None,
     *,
     band: tuple[float, float] = ALL_FREQUENCIES,
-    slack: float = SLACK,
+    slack: float = peaks.SETTINGS.slack,
 ) -> WorstCaseGain:
     """Largest gain from d to e over the declared uncertainty; `avis_ctrl.robust.mu_peak.worst_case_gain`.
 

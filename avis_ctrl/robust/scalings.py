@@ -17,11 +17,20 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, gain
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Maximum order of d(s): beyond it, the decrease of mu is not worth the additional controller states.
-MAX_ORDER = 6
-# Relative size below which a combination of the signals of a group is round-off.
-RANK = 1e-10
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class DScalingSettings:
+    """max_order : largest order of d(s): beyond it, the decrease of mu is not worth the additional controller states.
+    rank : relative size [1] below which a combination of the signals of a group is round-off.
+    """
+
+    max_order: int = 6
+    rank: float = 1e-10
+
+
+SETTINGS = DScalingSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,7 +462,7 @@ class Scalings:
                 signals = np.concatenate([at[k] for k in blocks])
                 gains = np.exp(np.concatenate([np.full(at[k].size, parts[k].scalar.theta[0]) for k in blocks]))
                 U, sizes, _ = np.linalg.svd(gains[:, None] * through[signals], full_matrices=False)
-                U = U[:, sizes > RANK * sizes[0]]
+                U = U[:, sizes > SETTINGS.rank * sizes[0]]
                 common = ScalarScaling(np.concatenate([[0.0], first.scalar.theta[1:]])).matrices
                 a, b, c = (np.kron(one, np.eye(U.shape[1])) for one in common[:3])
                 own = (

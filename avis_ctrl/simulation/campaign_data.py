@@ -29,18 +29,29 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan, RecordPlan
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
 from avis_ctrl.simulation.sampled_loop import SampledLoop, rig_bank
 
-# Largest level: fraction of the converter's range for the response to the drives, on the rig as specified in its file.
-# The rest is for ambient motion, noise and the table's differences from its file.
-RANGE_SHARE = 0.8
-# Range of sensors if the rig file has no converter; used for the level only, without clipping.
-ASSUMED_RANGE_V = 10.0
-DEFAULT_LEVEL_PERCENT = 50.0
-# Amplifier lag of rigs with accelerometers, as in design files.
-ACCELEROMETER_AMPLIFIER_HZ = 300.0
+
+@dataclass(frozen=True)
+class CampaignSettings:
+    """range_share : fraction of the converter's range for the response to the drives at the largest level [1], on the
+        rig as specified in its file. The rest is for ambient motion, noise and the table's differences from its file.
+    assumed_range_V : range of the sensors if the rig file has no converter; used for the level only, without clipping.
+    level_percent : level of a record whose plan states none: the highest level of the default plan.
+    amplifier_corner_Hz : corner of the amplifiers of rigs with accelerometers if none is stated, as in design files.
+    most_samples, most_samples_in_all : limits of a record and of a campaign, from memory: a record takes about 600
+        bytes per sample during its simulation, and 150 afterwards.
+    """
+
+    range_share: float = 0.8
+    assumed_range_V: float = 10.0
+    level_percent: float = 50.0
+    amplifier_corner_Hz: float = 300.0
+    most_samples: int = 4_000_000
+    most_samples_in_all: int = 20_000_000
+
+
+SETTINGS = CampaignSettings()
 # Random streams of a campaign's seed; numbered from 1, since trailing zeros do not change a seed.
 _SIGNALS, _FLOOR, _NOISE, _FLOOR_SENSOR = range(1, 5)
-# Limits from memory: a record takes about 600 bytes per sample during its simulation, and 150 afterwards.
-MOST_SAMPLES, MOST_SAMPLES_IN_ALL = 4_000_000, 20_000_000
 
 # (u (samples, n_u) [V], floor (samples, 3) [m/s], time of the first sample [s], first and last time of the campaign
 # [s]) -> (samples, n_y) [V] added to the sensor signals by effects outside the rig file
@@ -116,7 +127,7 @@ def open_loop(rig: Rig, plan: CampaignPlan) -> SampledLoop:
     # campaign's noise model is white.
     bank = rig_bank(rig, 1.0).white()
     if "acceleration" in bank.quantities:
-        corner = corner or ACCELEROMETER_AMPLIFIER_HZ
+        corner = corner or SETTINGS.amplifier_corner_Hz
     bank = replace(
         bank,
         noise_rms_V=bank.noise_rms_V if plan.sensors.noise else np.zeros(len(bank.chains)),
@@ -148,10 +159,10 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
         samples = round((one.duration_s or plan.duration_s) * fs)
         orthogonal = one.excitation == "multisine" and plan.multisine.scheme == "orthogonal"
         total += samples * one.records * (loop.n_drives if orthogonal else 1)
-        if not 2 <= samples <= MOST_SAMPLES or total > MOST_SAMPLES_IN_ALL:
+        if not 2 <= samples <= SETTINGS.most_samples or total > SETTINGS.most_samples_in_all:
             raise InputError(
-                f"expected records of 2 to {MOST_SAMPLES} samples at {fs:g} Hz, and no more than "
-                f"{MOST_SAMPLES_IN_ALL} in all records",
+                f"expected records of 2 to {SETTINGS.most_samples} samples at {fs:g} Hz, and no more than "
+                f"{SETTINGS.most_samples_in_all} in all records",
                 field=f"record[{line + 1}].duration_s",
                 value=one.duration_s or plan.duration_s,
             )
@@ -164,7 +175,7 @@ def _signals(loop: SampledLoop, plan: CampaignPlan, seed: int) -> Iterator[_Plan
         try:
             signals = _drawn(loop, plan, one, samples, dealt, int(_rng(seed, line, _SIGNALS).integers(2**63)))
             largest = largest_level(loop, signals, samples)
-            percent = one.level_percent or DEFAULT_LEVEL_PERCENT
+            percent = one.level_percent or SETTINGS.level_percent
             signals = signals.scaled_to(one.level_V or percent / 100 * largest)
         except InputError as error:
             field = {"rms_V": "level_V"}.get(error.field or "", error.field)
@@ -230,18 +241,18 @@ def _played(u: np.ndarray, samples: int) -> np.ndarray:
 def largest_level(loop: SampledLoop, signals: ExcitationSignals, samples: int) -> float:
     """Largest r.m.s. [V] at which neither drives nor converter clip, from a linear noise-free run of each record.
 
-    Computed for the rig as specified in its file. RANGE_SHARE of the converter's range is for the response to the
-    drives; without a converter, its range is taken as ASSUMED_RANGE_V.
+    Computed for the rig as specified in its file. `SETTINGS.range_share` of the converter's range is for the
+    response to the drives; without a converter, its range is taken as `SETTINGS.assumed_range_V`.
     """
     most = signals.scaled_to()
-    level, range_V = float(np.mean(most.rms_V)), ASSUMED_RANGE_V
+    level, range_V = float(np.mean(most.rms_V)), SETTINGS.assumed_range_V
     if loop.sensors.converter is not None:
         range_V = loop.sensors.converter.limits_V[1]
     nominal, peak = replace(loop, plant=loop.rig), 0.0
     for u in most.u:
         run = _run(nominal, _played(u, samples), 0, None, (0,), False)
         peak = max(peak, float(np.max(np.abs(run.sensed))))
-    return level * min(1.0, RANGE_SHARE * range_V / peak)
+    return level * min(1.0, SETTINGS.range_share * range_V / peak)
 
 
 def _run(
@@ -364,7 +375,7 @@ def _assumptions(loop: SampledLoop, plan: CampaignPlan, seed: int, ambient: Spec
     noises = f"sensor noise {_span(bank.noise_rms_V)} V r.m.s. per sample, " + (
         f"quantisation step {bank.converter.lsb_V:.4g} V"
         if bank.converter
-        else f"no quantisation, levels chosen for a range of {ASSUMED_RANGE_V:g} V"
+        else f"no quantisation, levels chosen for a range of {SETTINGS.assumed_range_V:g} V"
     )
     lag = (
         f"amplifiers with a first-order lag of {loop.amplifier_corner_Hz:g} Hz"

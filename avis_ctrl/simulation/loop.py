@@ -17,8 +17,18 @@ from avis_ctrl.simulation.discrete import linear_part, rest_state, step_arrays
 from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, SampledLoop, lever_arms
 
 Code = Callable[[np.ndarray], np.ndarray]
-# Motion relative to the floor beyond which the loop has diverged; the stops of an isolated table are closer [m, rad].
-STOPS = np.array([0.02, 0.2])
+
+
+@dataclass(frozen=True)
+class DivergenceSettings:
+    """stop_m, stop_rad : motion relative to the floor beyond which the loop has diverged; the stops of an isolated
+    table are closer."""
+
+    stop_m: float = 0.02
+    stop_rad: float = 0.2
+
+
+SETTINGS = DivergenceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +175,7 @@ def simulate(
         adc,
         loop.limits_V,
         windup,
-        STOPS,
+        np.array([SETTINGS.stop_m, SETTINGS.stop_rad]),
         records,
     )
     kept = slice(min(settle, done - 1), done)

@@ -24,8 +24,17 @@ from avis_ctrl.simulation.campaign_plan import CampaignPlan, EffectPlan
 # Flat names of parameters, AVIS and Halcyonics.
 STIFF_OR_HEAVY = re.compile(r"mass|J[123]|I(xx|yy|zz)|isolator\d+\.k_[xyz]|k_[atr]|k_s\d|load\.mass")
 DAMPING = re.compile(r"isolator\d+\.c_[xyz]|d[13456]")
-# Maximum number of draws. Physically impossible inertias are drawn again; nearly flat payloads need several draws.
-ATTEMPTS = 200
+
+
+@dataclass(frozen=True)
+class DrawSettings:
+    """attempts : largest number of draws of a table. Physically impossible inertias are drawn again; nearly flat
+    payloads need several draws."""
+
+    attempts: int = 200
+
+
+SETTINGS = DrawSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +115,7 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
         # With a load, the plate was identified before: only the sum of its inertia and the load's can be observed.
         known_before = ("mass", "load.mass", *(("Ixx", "Iyy", "Izz") if rig.load else ()))
         spread = {name: width for name, width in spread.items() if name not in known_before}
-    for _ in range(ATTEMPTS):
+    for _ in range(SETTINGS.attempts):
         draws = rng.uniform(-1, 1, len(spread))
         changes = {
             name: known[name].value * (1 + width * draw)
@@ -123,7 +132,7 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
         else:
             return truth
     raise InputError(
-        f"none of {ATTEMPTS} random draws gives a physically possible table; the last error: {refused}",
+        f"none of {SETTINGS.attempts} random draws gives a physically possible table; the last error: {refused}",
         field="perturb_percent",
         value=percent,
     )

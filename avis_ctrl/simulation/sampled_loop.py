@@ -27,8 +27,16 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import conditioning
 
-# Maximum number of steps per control period to represent the delay; a delay that needs more is probably mistyped.
-MAX_SUBSTEPS = 20
+
+@dataclass(frozen=True)
+class StepSettings:
+    """most_substeps : largest number of steps per control period to represent the delay; a delay that needs more is
+    probably mistyped."""
+
+    most_substeps: int = 20
+
+
+SETTINGS = StepSettings()
 # Default meaning the rig's own value.
 _AS_RIG: Any = None
 
@@ -156,7 +164,7 @@ class SampledLoop:
     Raises
     ------
     InputError : coordinates controlled twice, accelerometers with drives that act without lag, a delay that needs more
-        than MAX_SUBSTEPS steps per sample period.
+        than `SETTINGS.most_substeps` steps per sample period.
     """
 
     rig: Rig
@@ -191,10 +199,10 @@ class SampledLoop:
                 object.__setattr__(self, name, value)
         object.__setattr__(self, "drive_errors", tuple(self.drive_errors) or (None,) * self.n_drives)
         self._check()
-        periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(MAX_SUBSTEPS)
+        periods = Fraction(self.loop_delay_s * self.sample_rate_Hz).limit_denominator(SETTINGS.most_substeps)
         if abs(float(periods) - self.loop_delay_s * self.sample_rate_Hz) > 1e-6:
             raise InputError(
-                f"expected n/m sample periods with whole n and m, m up to {MAX_SUBSTEPS}; the nearest is "
+                f"expected n/m sample periods with whole n and m, m up to {SETTINGS.most_substeps}; the nearest is "
                 f"{float(periods) / self.sample_rate_Hz:.6g} s",
                 field="loop_delay_s of the rig",
                 value=self.loop_delay_s,

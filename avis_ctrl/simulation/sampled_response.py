@@ -23,9 +23,20 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
 
-# Accelerometers are most sensitive to the jumps of force: their images decay only as 1/k^2, to 0.1 % after 20.
-IMAGES = 20
-SMOOTH_POINTS = 40
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """images : number of pairs of images. Accelerometers are most sensitive to the jumps of force: their images decay
+        only as 1/k^2, to 0.1 % after 20.
+    points : largest number of frequencies at which the images are summed; between them the sum, which is smooth, is
+        interpolated.
+    """
+
+    images: int = 20
+    points: int = 40
+
+
+SETTINGS = ImageSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +90,7 @@ class OpenResponse:
     sensed_volts: np.ndarray
 
 
-def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> SampledResponse:
+def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = SETTINGS.images) -> SampledResponse:
     """Closed-loop responses of the linear loop at the frequencies omega [rad/s].
 
     images : number of pairs of images included, at least one.
@@ -100,7 +111,7 @@ def sampled_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES)
     )
 
 
-def open_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) -> OpenResponse:
+def open_response(loop: SampledLoop, omega: np.ndarray, images: int = SETTINGS.images) -> OpenResponse:
     """Responses of table, drives and sensors without the controller, at omega (n,) [rad/s]."""
     return OpenResponse(
         *(centre + folded for centre, folded in zip(_image(loop, omega), _folded(loop, omega, images), strict=True))
@@ -110,7 +121,7 @@ def open_response(loop: SampledLoop, omega: np.ndarray, images: int = IMAGES) ->
 def _folded(loop: SampledLoop, omega: np.ndarray, images: int) -> list[np.ndarray]:
     """Sum of all images except the centre: far above every resonance, hence smooth and interpolated from a few
     points."""
-    points = omega if omega.size <= SMOOTH_POINTS else np.linspace(omega.min(), omega.max(), SMOOTH_POINTS)
+    points = omega if omega.size <= SETTINGS.points else np.linspace(omega.min(), omega.max(), SETTINGS.points)
     shifts = 2 * np.pi / loop.period_s * np.array([k for k in range(-images, images + 1) if k])
     parts = _image(loop, (shifts[:, None] + points).ravel())
     sums = [part.reshape(shifts.size, points.size, *part.shape[1:]).sum(axis=0) for part in parts]

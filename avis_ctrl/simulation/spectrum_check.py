@@ -26,10 +26,21 @@ from avis_ctrl.simulation.loop import SimulationRecord
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.simulation.sampled_response import sampled_response
 
-# Points of the predicted density per line of the estimate: a resonance as narrow as a line is still resolved.
-POINTS_PER_LINE = 4
-# Distances beyond which the Hann window's side lobes (18 dB per octave) and the correlation of segments are neglected.
-REACH_LINES, REACH_SEGMENTS = 8, 6
+
+@dataclass(frozen=True)
+class WelchSettings:
+    """points_per_line : points of the predicted density per line of the estimate: a resonance as narrow as a line is
+        still resolved.
+    lines, segments : distances beyond which the Hann window's side lobes (18 dB per octave) and the correlation of
+        segments are neglected.
+    """
+
+    points_per_line: int = 4
+    lines: int = 8
+    segments: int = 6
+
+
+SETTINGS = WelchSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +101,23 @@ class SpectrumAgreement:
 
 
 def welch_moments(psd: np.ndarray, segments: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (n,) and covariance (n, REACH_LINES + 1) of Welch's estimate at lines 0..n-1; column d: of lines j and j +
-    d.
+    """Mean (n,) and covariance (n, n_d) of Welch's estimate at lines 0..n-1; column d: of lines j and j + d.
 
-    psd : the true density at 0, 1/4, 2/4 .. lines (POINTS_PER_LINE), up to REACH_LINES beyond line n-1.
+    psd : the true density at 0, 1/4, 2/4 .. lines (`SETTINGS.points_per_line`), up to `SETTINGS.lines` = n_d - 1 lines
+        beyond line n-1.
     segments : number of Hann windows, which overlap by half.
 
     With X_m(j) the transform of segment m at line j of a Gaussian process, cov(|X_m(j)|^2, |X_n(k)|^2) = |E X_m(j) conj
     X_n(k)|^2, where E is the integral of psd(f) W(f - j) conj W(f - k) exp(i pi f (m - n)).
     """
-    reach = REACH_LINES * POINTS_PER_LINE
-    around = sliding_window_view(np.concatenate([np.zeros(reach), psd]), 2 * reach + 1)[::POINTS_PER_LINE]
-    x = np.arange(-reach, reach + 1) / POINTS_PER_LINE
-    apart, W = np.arange(REACH_LINES + 1), _hann_transform(x)
-    pairs = W[:, None] * _hann_transform(x[:, None] - apart) / POINTS_PER_LINE
+    density = SETTINGS.points_per_line
+    reach = SETTINGS.lines * density
+    around = sliding_window_view(np.concatenate([np.zeros(reach), psd]), 2 * reach + 1)[::density]
+    x = np.arange(-reach, reach + 1) / density
+    apart, W = np.arange(SETTINGS.lines + 1), _hann_transform(x)
+    pairs = W[:, None] * _hann_transform(x[:, None] - apart) / density
     covariance = np.zeros((around.shape[0], apart.size))
-    for lag in range(min(REACH_SEGMENTS, segments)):
+    for lag in range(min(SETTINGS.segments, segments)):
         share = (segments - lag) * (1 if lag == 0 else 2) / segments**2
         turned = np.exp(1j * np.pi * x * lag)[:, None] * pairs
         covariance += share * ((around @ turned.real) ** 2 + (around @ turned.imag) ** 2)
@@ -149,7 +161,8 @@ def check_spectrum_agreement(
     kept = [COORDINATES.index(axis) for axis in axes]
     arms = lever_arms(loop.rig)[kept]
     lines = int(last[-1]) + 1
-    fine = np.arange(1, (lines + REACH_LINES) * POINTS_PER_LINE + 1) * line_Hz / POINTS_PER_LINE
+    density = SETTINGS.points_per_line
+    fine = np.arange(1, (lines + SETTINGS.lines) * density + 1) * line_Hz / density
     # The density at zero frequency is set to zero because the estimate removes each segment's mean.
     predicted = sampled_response(loop, 2 * np.pi * fine).velocity_psd()[:, kept] * arms**2
     psd = np.pad(predicted.T, ((0, 0), (1, 0)))
@@ -191,7 +204,7 @@ def _variance_of_sum(covariance: np.ndarray, first: int, last: int) -> float:
     return float(
         sum(
             (1 if d == 0 else 2) * np.sum(covariance[first : last + 1 - d, d])
-            for d in range(min(REACH_LINES, last - first) + 1)
+            for d in range(min(SETTINGS.lines, last - first) + 1)
         )
     )
 
@@ -210,6 +223,6 @@ def _bands(
             field="segment_s",
             value=1 / line_Hz,
         )
-    if (last[-1] + REACH_LINES) * line_Hz >= sample_rate_Hz / 2:
+    if (last[-1] + SETTINGS.lines) * line_Hz >= sample_rate_Hz / 2:
         raise InputError(f"bands below half the sample rate of {sample_rate_Hz:g} Hz", field="band_Hz", value=band_Hz)
     return mid, first, last

@@ -24,34 +24,36 @@ from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResul
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
-# Upper bounds are proved to within 0.5 % (0.04 dB) of the largest value found; tighter bounds only cost time.
-SLACK = 5e-3
-
 
 @dataclass(frozen=True)
 class AnalysisSettings:
     """Settings of the analysis.
 
-    passive_slack : replaces `SLACK` for the worst-case gains of the passive table if there are many blocks: its narrow
+    slack : relative excess [1] of upper bounds over the largest value found (0.5 %, 0.04 dB); tighter bounds only cost
+        time.
+    passive_slack : replaces `slack` for the worst-case gains of the passive table if there are many blocks: its narrow
         peaks need many frequency intervals. passive_stability_slack : the same for its robust stability, where mu is
         flat over frequency.
     few_points : number of frequencies of the upper bound of the worst-case gain if no curve is drawn, in addition to
         the frequencies of the highest gains.
     axis_points : number of frequencies of the lower bound of an axis, in a band of two or three octaves.
+    plot_Hz, plot_points : range and number of the frequencies of curves: the modes of a table and a decade on either
+        side, about 90 to a decade, so that a resonance is drawn as a curve.
+    peak_factor : level relative to the r.m.s. [1] that a Gaussian signal of 10 Hz bandwidth exceeds once in ten
+        minutes: sqrt(2 ln(f T)), Rice 1944.
     """
 
+    slack: float = 5e-3
     passive_slack: float = 2e-2
     passive_stability_slack: float = 5e-2
     few_points: int = 0
     axis_points: int = 24
+    plot_Hz: tuple[float, float] = (0.1, 200.0)
+    plot_points: int = 300
+    peak_factor: float = float(np.sqrt(2 * np.log(600.0 * 10.0)))
 
 
 SETTINGS = AnalysisSettings()
-PLOT_HZ = np.geomspace(0.1, 200.0, 300)
-# Level, relative to the r.m.s., that a Gaussian signal of this bandwidth exceeds once in ten minutes: sqrt(2 ln(f T)),
-# Rice 1944.
-PEAK_SECONDS, PEAK_BANDWIDTH_HZ = 600.0, 10.0
-PEAK_FACTOR = float(np.sqrt(2 * np.log(PEAK_SECONDS * PEAK_BANDWIDTH_HZ)))
 
 
 def analyse(
@@ -90,14 +92,13 @@ def analyse(
     nominal = performance.select(slice(n_z, None), slice(n_w, None))
     fastest = float(np.max(np.abs(K.poles()), initial=0.0)) / (2 * np.pi) if K is not None else 0.0
     loose = K is None and blocks.many
-    robust = mu_peak(
-        performance.select(slice(n_z), slice(n_w)), blocks, slack=SETTINGS.passive_stability_slack if loose else SLACK
-    )
-    slack = SETTINGS.passive_slack if loose else SLACK
+    slack = SETTINGS.passive_stability_slack if loose else SETTINGS.slack
+    robust = mu_peak(performance.select(slice(n_z), slice(n_w)), blocks, slack=slack)
+    slack = SETTINGS.passive_slack if loose else SETTINGS.slack
     band, few = (2 * np.pi * low, 2 * np.pi * high), SETTINGS.few_points
     worst_peak = worst_case_gain(motion, blocks, slack=slack, robust=robust)
     worst_band = worst_case_gain(motion, blocks, band=band, slack=slack, robust=robust, points=few)
-    omega = 2 * np.pi * PLOT_HZ
+    omega = 2 * np.pi * np.geomspace(*SETTINGS.plot_Hz, SETTINGS.plot_points)
     return ControllerResult(
         name,
         title,
@@ -105,7 +106,7 @@ def analyse(
         K,
         full.is_stable(),
         hinf_norm(nominal).gain,
-        bound(plant, blocks, mu_peak(performance, all_blocks, slack=SLACK)),
+        bound(plant, blocks, mu_peak(performance, all_blocks, slack=SETTINGS.slack)),
         bound(plant, blocks, robust),
         bound(plant, blocks, worst_peak),
         bound(plant, blocks, worst_band),
@@ -134,7 +135,7 @@ def worst_of_axis(
     band = design.transmissibility.band_Hz[0] * 2 * np.pi, design.transmissibility.band_Hz[1] * 2 * np.pi
     if stability is not None:
         return worst_case_gain(
-            motion, blocks, band=band, slack=SLACK, robust=stability, points=SETTINGS.few_points
+            motion, blocks, band=band, slack=SETTINGS.slack, robust=stability, points=SETTINGS.few_points
         ).upper
     omega = np.geomspace(*band, SETTINGS.axis_points)
     return float(np.max(worst_gain(motion.frequency_response(omega), blocks).gain))
@@ -242,5 +243,5 @@ def site_response(plant: DesignPlant, full: StateSpace, controlled: bool, band_H
         rating(bands, payload.max(axis=1)),
         rating(bands, on_floor),
         volts,
-        {name: PEAK_FACTOR * value for name, value in volts.items()},
+        {name: SETTINGS.peak_factor * value for name, value in volts.items()},
     )

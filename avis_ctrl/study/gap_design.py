@@ -27,7 +27,7 @@ from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
-from avis_ctrl.study.analysis import SLACK
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
@@ -261,12 +261,12 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
     performance = plant.synthesis.closed(K)
     motion = plant.full.restricted(plant.floor_velocities, plant.velocities).closed(K)
     blocks = plant.synthesis.blocks
-    mu = mu_peak(performance, plant.synthesis.all_blocks, slack=SLACK)
+    mu = mu_peak(performance, plant.synthesis.all_blocks, slack=ANALYSIS.slack)
     low, high = design.transmissibility.band_Hz
     nominal = motion.select(slice(blocks.n_z, None), slice(blocks.n_w, None))
     in_band = nominal.frequency_response(2 * np.pi * np.geomspace(low, high, 400))
-    worst = worst_case_gain(motion, blocks, slack=SLACK)
-    worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK)
+    worst = worst_case_gain(motion, blocks, slack=ANALYSIS.slack)
+    worst_band = worst_case_gain(motion, blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=ANALYSIS.slack)
     return LoopFigures(
         True,
         in_six,

@@ -47,8 +47,18 @@ DESCRIBED_IN: Mapping[str, str] = {
 }
 
 
-# Error of the approximated delay, at the bandwidth of the drives, above which its order is raised (to 6 at most).
-DELAY_ERROR = 0.02
+@dataclass(frozen=True)
+class DelaySettings:
+    """error : error of the approximated delay, at the bandwidth of the drives [1], above which its order is raised: far
+        below the uncertainty of a drive.
+    most_order : largest order: the largest of a design file.
+    """
+
+    error: float = 0.02
+    most_order: int = 6
+
+
+SETTINGS = DelaySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +130,8 @@ def _loop(rig: Rig, design: Design, model: TableModel) -> tuple[Rig, Design]:
 def delay_order(design: Design, rig: Rig) -> tuple[int, float]:
     """Order of the design's delay, at least its own, and the remaining error at the bandwidth of its drives."""
     omega = 2 * np.pi * design.control_effort.bandwidth_Hz
-    return sufficient_order(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, omega, DELAY_ERROR, 6, design.loop.pade_order)
+    delay_s = rig.loop_delay_s + 0.5 / rig.sample_rate_Hz
+    return sufficient_order(delay_s, omega, SETTINGS.error, SETTINGS.most_order, design.loop.pade_order)
 
 
 def _rebuilt(plant: DesignPlant, parts: tuple[Part, ...], rig: StateSpace) -> DesignPlant:

@@ -39,7 +39,7 @@ from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
+from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
 from avis_ctrl.study.plausible_fit import far_from_file
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.record_checks import check_campaign
@@ -220,7 +220,7 @@ def amplifier_corner(rig: Rig, stated_Hz: float | None) -> float | None:
     jumps exactly at the sampling instant.
     """
     if stated_Hz is None and any(one.quantity == "acceleration" for one in rig.sensors()):
-        return ACCELEROMETER_AMPLIFIER_HZ
+        return CAMPAIGN.amplifier_corner_Hz
     return stated_Hz
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,15 @@ from avis_ctrl.study.file_names import IDENTIFICATION_FILES, REPORT_FILES, RESUL
 from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.study.identification import Identification
 
-PIECE = 1 << 17
+
+@dataclass(frozen=True)
+class PredictionSettings:
+    """piece : number of samples that are predicted and written at once, for memory: 1 MB a channel."""
+
+    piece: int = 1 << 17
+
+
+SETTINGS = PredictionSettings()
 
 
 def identified_rig(model: ResponseModel) -> Rig:
@@ -224,7 +232,7 @@ def write_predictions(
             data.attrs.update({"names": np.array(h.y_names, dtype=object).astype("S"), "unit": h.y_unit})
             group.attrs["sample_rate_Hz"] = h.sample_rate_Hz
             predictor = Predictor(model, large_motion=True)
-            for start, stop in ranges(h.samples, PIECE):
+            for start, stop in ranges(h.samples, SETTINGS.piece):
                 # Includes the next sample: the floor is interpolated linearly to it within this piece.
                 u, floor = model_inputs(model, record.load(start, min(stop + 1, h.samples)))
                 y = predictor.read(u[: stop - start], floor)

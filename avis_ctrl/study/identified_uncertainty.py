@@ -18,8 +18,18 @@ from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
 # Names of the uncertainty blocks.
 RESPONSE, DIRECTION = "identified response", "identified direction {}"
-# Frequencies at which directions are compared: the range of transmissibility, independent of the measured band.
-JUDGED_HZ = np.geomspace(0.1, 100.0, 200)
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """band_Hz, points : range and number of the frequencies at which directions are compared: the range of
+    transmissibility, independent of the measured band."""
+
+    band_Hz: tuple[float, float] = (0.1, 100.0)
+    points: int = 200
+
+
+SETTINGS = ComparisonSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +100,8 @@ def in_design(
     values, own = spread.values(), [name in rig.parameters() for name in content.names]
     names = [name for name, here in zip(content.names, own, strict=True) if here]
     # Sensors and delay are not parameters of the rig's equations: the measured spread covers their errors.
-    found = directions_that_matter(rig, names, content.factor()[own], keep, 2 * np.pi * JUDGED_HZ, confidence)
+    judged = 2 * np.pi * np.geomspace(*SETTINGS.band_Hz, SETTINGS.points)
+    found = directions_that_matter(rig, names, content.factor()[own], keep, judged, confidence)
     directions = tuple(
         UncertainDirection(
             DIRECTION.format(k), tuple((name, float(change)) for name, change in zip(names, row, strict=True) if change)

@@ -5,6 +5,7 @@ Every key has its unit in its name. Errors are one line that names file, field, 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,9 +16,19 @@ from avis_ctrl.study.toml_text import toml_text
 
 __all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
 
-# Floor motion if the rig file does not state it: the value of the AVIS file; and motion of a shaken floor, a hundred
-# times as much, which exceeds the effect of the drives' noise [m/s].
-AMBIENT_M_PER_S, SHAKEN_M_PER_S = 2e-6, 2e-4
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """ambient_m_per_s : r.m.s. floor motion if the rig file does not state it: the value of the AVIS file.
+    shaken_m_per_s : r.m.s. motion of a shaken floor, a hundred times as much, which exceeds the effect of the drives'
+        noise.
+    """
+
+    ambient_m_per_s: float = 2e-6
+    shaken_m_per_s: float = 2e-4
+
+
+SETTINGS = PlanSettings()
 
 
 def read_plan(path: str | Path) -> CampaignPlan:
@@ -50,7 +61,7 @@ def default_plan(
         entries of the frequency response at every line.
     perturbed : stiffness, mass and inertia within 5 %, damping within 20 %.
     """
-    ambient = {} if rig.ambient is not None else {"velocity_rms_m_per_s": AMBIENT_M_PER_S}
+    ambient = {} if rig.ambient is not None else {"velocity_rms_m_per_s": SETTINGS.ambient_m_per_s}
     most = 2 if scheme == "zippered" else 1
     records: list[dict[str, Any]] = [
         {"excitation": "multisine", "level_percent": level, "records": count}
@@ -59,7 +70,7 @@ def default_plan(
     records += [
         {"excitation": "noise", "level_percent": 50.0},
         {"excitation": "rest"},
-        {"excitation": "floor", "floor_rms_m_per_s": SHAKEN_M_PER_S, "band_Hz": [0.5, 60.0]},
+        {"excitation": "floor", "floor_rms_m_per_s": SETTINGS.shaken_m_per_s, "band_Hz": [0.5, 60.0]},
     ]
     truth = {"perturb_percent": 5.0, "perturb_damping_percent": 20.0} if perturbed else {}
     return plan_from_table(

@@ -43,10 +43,20 @@ from avis_ctrl.study.verdict import check_loop, check_requirements
 from avis_ctrl.study.workers import Workers
 
 Progress = Callable[[str], None]
-SAMPLES = 60
 # Context of the D-K iteration; it gives a function that is called after each step and returns whether to stop.
 Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """samples : number of perturbations for the range of sampled transmissibilities: enough for the picture, the bounds
+    do not depend on it."""
+
+    samples: int = 60
+
+
+SETTINGS = SampleSettings()
 
 
 def run_design(
@@ -129,7 +139,7 @@ def start_bounds(
     design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
 ) -> PendingBounds:
     """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design requires."""
-    samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
+    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
     limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
     jobs = {}
     if limit is not None:
@@ -235,7 +245,7 @@ def compare(
     ------
     ComputationError : the mu controller, or the passive table, could not be analysed.
     """
-    samples = random_perturbations(plant, SAMPLES, design.simulation.seed)
+    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
     begun = early.bounds if early is not None else {}
     with Workers() as workers:
         jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}

@@ -19,20 +19,19 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, worst_case_gain
 from avis_ctrl.simulation.sampled_loop import lever_arms
-from avis_ctrl.study.analysis import SETTINGS, SLACK
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import DesignPlant
 
-# Tilt corner well below the table's modes, roll-off well above the bandwidth of its loops.
-CUSTOMARY_CORNERS_HZ = (0.1, 100.0)
-TUNING_HZ = np.concatenate([np.geomspace(0.1, 5.0, 20), np.geomspace(5.5, 200.0, 44), [300.0, 400.0]])
-
 
 @dataclass(frozen=True)
 class SkyhookSettings:
-    """Limits of the search for the worst case. Every limit is a count, not a time.
+    """The classical tuning, and limits of the search for the worst case. Every limit is a count, not a time.
 
+    corners_Hz : corners of the classical loops: tilt corner well below the table's modes, roll-off well above the
+        bandwidth of its loops.
+    frequencies_Hz : at which tunings are compared: densest from 5.5 to 200 Hz, up to the highest roll-off of a search.
     samples : number of plants on the boundary of the set at the start of the search.
     rounds : maximum number of times that the worst case of the best tuning is added to the samples.
     agreement : relative excess of a worst case over the samples' largest value above which it is added to them.
@@ -45,6 +44,13 @@ class SkyhookSettings:
     ascents, ascent_steps : effort of the search for a worst case at each frequency.
     """
 
+    corners_Hz: tuple[float, float] = (0.1, 100.0)
+    frequencies_Hz: tuple[float, ...] = (
+        *np.geomspace(0.1, 5.0, 20).tolist(),
+        *np.geomspace(5.5, 200.0, 44).tolist(),
+        300.0,
+        400.0,
+    )
     samples: int = 16
     rounds: int = 12
     agreement: float = 0.01
@@ -54,6 +60,9 @@ class SkyhookSettings:
     beside: tuple[float, ...] = (0.95, 0.98, 0.99, 1.0, 1.01, 1.02, 1.05)
     ascents: int = 2
     ascent_steps: int = 12
+
+
+SETTINGS = SkyhookSettings()
 
 
 def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate:
@@ -66,11 +75,11 @@ def classical_skyhook(plant: DesignPlant, rig: Rig, design: Design) -> Candidate
 
 def classical_loops(plant: DesignPlant, rig: Rig, design: Design) -> Skyhook:
     """The loops of `classical_skyhook`."""
-    return Skyhook(plant.axes, critical_gains(rig, design.keep), *CUSTOMARY_CORNERS_HZ)
+    return Skyhook(plant.axes, critical_gains(rig, design.keep), *SETTINGS.corners_Hz)
 
 
 def tuned_skyhook(
-    plant: DesignPlant, rig: Rig, design: Design, peak_limit: float, settings: SkyhookSettings = SkyhookSettings()
+    plant: DesignPlant, rig: Rig, design: Design, peak_limit: float, settings: SkyhookSettings = SETTINGS
 ) -> Candidate:
     """The best skyhook found for a limit on the worst-case peak: gains of all axes and both corners.
 
@@ -87,7 +96,7 @@ def tuned_skyhook(
     ranked = [(evaluation.certified(classical)[0], classical)]
     task, highest = evaluation.search(rig), settings.room * peak_limit
     target = highest
-    points = [task.search.point(1.0, CUSTOMARY_CORNERS_HZ)]
+    points = [task.search.point(1.0, (classical.tilt_corner_Hz, classical.roll_off_Hz))]
     for _ in range(settings.certified):
         found, points, task = evaluation.tuned(task, points, target)
         loops = task.search.skyhook(plant.axes, found)
@@ -157,7 +166,7 @@ class WorstCaseTuning:
             plant.full,
             plant.floor_velocities,
             plant.velocities,
-            2 * np.pi * TUNING_HZ,
+            2 * np.pi * np.array(self.settings.frequencies_Hz),
             self.settings.samples,
             self.design.simulation.seed,
         )
@@ -222,13 +231,13 @@ class WorstCaseTuning:
         closed = motion.closed(loops.controller())
         if not closed.is_stable():
             return Merit(np.inf, np.inf, self.peak_limit, 1.0), None
-        worst = worst_case_gain(closed, motion.blocks, slack=SLACK, points=SETTINGS.few_points)
+        slack, few = ANALYSIS.slack, ANALYSIS.few_points
+        worst = worst_case_gain(closed, motion.blocks, slack=slack, points=few)
         if worst.upper > self.peak_limit:
             return Merit(worst.upper, np.inf, self.peak_limit), worst
         low, high = self.band_Hz
-        band = worst_case_gain(
-            closed, motion.blocks, band=(2 * np.pi * low, 2 * np.pi * high), slack=SLACK, points=SETTINGS.few_points
-        )
+        band_rad_s = 2 * np.pi * low, 2 * np.pi * high
+        band = worst_case_gain(closed, motion.blocks, band=band_rad_s, slack=slack, points=few)
         return Merit(worst.upper, band.upper, self.peak_limit), worst
 
 

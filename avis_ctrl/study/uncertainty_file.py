@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,17 +20,22 @@ from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_sections import NotNegative, Number, Positive
 from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
 
-# An isolation table has a few dozen parameters; a file with many more does not describe a rig.
-MOST_PARAMETERS, MOST_POINTS = 500, 20_000
 
-LARGEST = 1e12
-Finite = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, le=LARGEST)]
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+@dataclass(frozen=True)
+class FileSettings:
+    """most_parameters, most_points : largest numbers of parameters and of frequencies that are read. An isolation table
+    has a few dozen parameters; a file with many more does not describe a rig."""
+
+    most_parameters: int = 500
+    most_points: int = 20_000
+
+
+SETTINGS = FileSettings()
 Share = Annotated[float, Field(gt=0, lt=1)]
-Pair = Annotated[list[Finite], Field(min_length=2, max_length=2)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 
 class ParameterSection(Section):
@@ -37,7 +43,7 @@ class ParameterSection(Section):
 
     name: str
     unit: str
-    value: Finite
+    value: Number
     scale: Positive
 
 
@@ -45,7 +51,7 @@ class DirectionSection(Section):
     """A determined combination: relative standard deviation, and unit vector in relative parameters."""
 
     standard_deviation: NotNegative
-    vector: list[Finite]
+    vector: list[Number]
 
 
 class WeightSection(Section):
@@ -65,7 +71,7 @@ class SpreadSection(Section):
     """Largest singular value of the relative error in the kept coordinates: measured, and quantiles of its noise."""
 
     keep: Annotated[list[str], Field(min_length=1)]
-    frequency_Hz: Annotated[list[Positive], Field(min_length=2, max_length=MOST_POINTS)]
+    frequency_Hz: Annotated[list[Positive], Field(min_length=2, max_length=SETTINGS.most_points)]
     measured: list[NotNegative]
     confidence: Annotated[list[Share], Field(min_length=1, max_length=50)]
     noise: list[list[NotNegative]]
@@ -98,8 +104,8 @@ class UncertaintyFile(Section):
     version: Literal[1]
     rig: str
     rig_sha256: str
-    parameter: Annotated[list[ParameterSection], Field(max_length=MOST_PARAMETERS)]
-    covariance: list[list[Finite]]
+    parameter: Annotated[list[ParameterSection], Field(max_length=SETTINGS.most_parameters)]
+    covariance: list[list[Number]]
     direction: list[DirectionSection]
     undetermined: Annotated[int, Field(ge=0)] = 0
     spread: Annotated[list[SpreadSection], Field(min_length=1)]

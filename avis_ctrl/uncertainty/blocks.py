@@ -91,10 +91,16 @@ class ComplexFull(Block):
         super().__init__(rows, rows if cols is None else cols, name)
 
 
-# Number of blocks above which full scalings (matrices for repeated blocks, G for real blocks) cost more than they gain
-# at most frequencies: 20 ms per matrix with one number per block, 37 ms with full scalings (34 blocks, 47 signals); 24
-# and 142 ms if blocks of up to six rows are repeated (23 blocks, 49 signals).
-MANY = 16
+@dataclass(frozen=True)
+class BlockSettings:
+    """many : number of blocks from which full scalings (matrices for repeated blocks, G for real blocks) cost more
+    than they gain at most frequencies: 20 ms per matrix with one number per block, 37 ms with full scalings (34 blocks,
+    47 signals); 24 and 142 ms if blocks of up to six rows are repeated (23 blocks, 49 signals)."""
+
+    many: int = 16
+
+
+SETTINGS = BlockSettings()
 
 
 @dataclass(frozen=True)
@@ -149,7 +155,7 @@ class BlockStructure:
     @property
     def many(self) -> bool:
         """Whether there are so many blocks that scalings with one number per block are tried first."""
-        return len(self.blocks) >= MANY
+        return len(self.blocks) >= SETTINGS.many
 
     def simplified(self) -> BlockStructure:
         """Complexified, with every repeated scalar replaced by a full block: a superset of perturbations, with one real

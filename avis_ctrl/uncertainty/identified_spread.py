@@ -12,11 +12,24 @@ from avis_ctrl.lti.rational import Rational
 from avis_ctrl.uncertainty.weight_base import Weight, smallest_cover
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
-POINTS_PER_OCTAVE = 8
-# Factor in frequency by which the fit extends beyond the data (and beyond a declared crossover).
-REACH = 10.0
-# Slopes of the envelope and maximum orders: the flatter envelope is used if order 6 cannot follow the steep one.
-SLOPES, ORDERS = (2.0, 1.0), (6, 12)
+
+@dataclass(frozen=True)
+class SpreadSettings:
+    """points_per_octave : frequencies of the fit added between the data: the steep envelope changes by 1.5 dB at most
+        from one to the next.
+    reach : factor in frequency [1] by which the fit extends beyond the data (and beyond a declared crossover), so that
+        the filter follows the ends of the envelope.
+    slopes, orders : slopes of the envelope [decades per decade] and largest orders of its filter: the flatter envelope
+        is used if order 6 cannot follow the steep one.
+    """
+
+    points_per_octave: int = 8
+    reach: float = 10.0
+    slopes: tuple[float, ...] = (2.0, 1.0)
+    orders: tuple[int, ...] = (6, 12)
+
+
+SETTINGS = SpreadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +69,12 @@ class IdentifiedSpread(Weight):
     @cached_property
     def grid(self) -> np.ndarray:
         """Frequencies [rad/s] of the fit: those of the data and a decade on either side, or beyond a crossover."""
-        low, high = self.omega[0] / REACH, self.omega[-1] * REACH
+        low, high = self.omega[0] / SETTINGS.reach, self.omega[-1] * SETTINGS.reach
         if self.declared is not None:
-            high = max(high, 2 * np.pi * self.declared.crossover_Hz * REACH)
-        even = np.geomspace(low, high, int(POINTS_PER_OCTAVE * np.log2(high / low)) + 1)
-        apart = np.min(np.abs(np.log(even[:, None] / self.omega)), axis=1) > 0.25 * np.log(2) / POINTS_PER_OCTAVE
+            high = max(high, 2 * np.pi * self.declared.crossover_Hz * SETTINGS.reach)
+        density = SETTINGS.points_per_octave
+        even = np.geomspace(low, high, int(density * np.log2(high / low)) + 1)
+        apart = np.min(np.abs(np.log(even[:, None] / self.omega)), axis=1) > 0.25 * np.log(2) / density
         return np.sort(np.concatenate([even[apart], self.omega]))
 
     def envelope(self, omega: np.ndarray) -> np.ndarray:
@@ -108,7 +122,7 @@ def covering_spread(
     """
     steep, flat = (
         IdentifiedSpread(omega, data, declared, factor, slope, max_order=order)
-        for slope, order in zip(SLOPES, ORDERS, strict=True)
+        for slope, order in zip(SETTINGS.slopes, SETTINGS.orders, strict=True)
     )
     try:
         _ = steep.shape

@@ -9,6 +9,7 @@ could disagree with the model.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -17,8 +18,17 @@ from avis_ctrl.errors import ComputationError
 
 Exponents = tuple[int, ...]
 MatrixFunction = Callable[[np.ndarray], np.ndarray]
-# Fraction of an entry below which a coefficient is round-off, since an entry takes a few hundred operations.
-ROUND_OFF = 1e3 * np.finfo(float).eps
+
+
+@dataclass(frozen=True)
+class PolynomialSettings:
+    """round_off : fraction of an entry [1] below which a coefficient is round-off: an entry takes a few hundred
+    operations."""
+
+    round_off: float = 1e3 * float(np.finfo(float).eps)
+
+
+SETTINGS = PolynomialSettings()
 
 
 def polynomial_coefficients(
@@ -46,7 +56,7 @@ def polynomial_coefficients(
     # Each entry has its own unit, so it is compared with its own largest variation.
     size = np.max(np.abs(values), axis=0)
     # For an entry that hardly varies, the round-off of its terms would be taken for a dependence.
-    least = np.maximum(tolerance * size, ROUND_OFF * np.abs(base))
+    least = np.maximum(tolerance * size, SETTINGS.round_off * np.abs(base))
     found = {(0,) * n: base}
     for exponents, coefficient in zip(monomials, coefficients, strict=True):
         matrix = coefficient.reshape(base.shape)

@@ -59,8 +59,15 @@ class UncertainParameter:
         return f"{self.name} at {100 * delta * self.spread:+.3g} %"
 
 
-# Maximum number of parameters in the description of a direction; the model contains all of them.
-WORDS = 4
+@dataclass(frozen=True)
+class DirectionSettings:
+    """named : largest number of parameters in the description of a direction, so that it stays a line; the model
+    contains all of them."""
+
+    named: int = 4
+
+
+SETTINGS = DirectionSettings()
 
 
 @dataclass(frozen=True)
@@ -85,10 +92,10 @@ class UncertainDirection:
             f"{name} {100 * delta * sizes[name]:+.2g} %"
             if nominal[name]
             else f"{name} {delta * change:+.2g} {units[name]}"
-            for name, change in most[:WORDS]
+            for name, change in most[: SETTINGS.named]
         ]
-        if len(most) > WORDS:
-            words.append(f"and {len(most) - WORDS} parameters by less")
+        if len(most) > SETTINGS.named:
+            words.append(f"and {len(most) - SETTINGS.named} parameters by less")
         return f"{self.name} at {delta:+.2g}: {', '.join(words)}"
 
     def stretch(self, nominal: Mapping[str, float], change: float) -> float:

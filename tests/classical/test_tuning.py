@@ -17,10 +17,10 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_file import read_design
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.skyhooks import TUNING_HZ, critical_gains
+from avis_ctrl.study.skyhooks import SETTINGS, critical_gains
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
-OMEGA = 2 * np.pi * TUNING_HZ
+OMEGA = 2 * np.pi * np.array(SETTINGS.frequencies_Hz)
 BAND_HZ = (1.0, 10.0)
 
 
@@ -147,7 +147,7 @@ def tuned(scenarios, critical) -> tuple[Skyhook, float]:
 def measured(scenarios: Scenarios, skyhook: Skyhook) -> tuple[float, float]:
     """Largest singular value over all samples: everywhere, and in the band."""
     sigma = np.linalg.norm(scenarios.channels().closed(diagonal(skyhook, OMEGA)), ord=2, axis=(-2, -1))
-    inside = [BAND_HZ[0] <= f <= BAND_HZ[1] for f in TUNING_HZ]
+    inside = [BAND_HZ[0] <= f <= BAND_HZ[1] for f in SETTINGS.frequencies_Hz]
     return float(sigma.max()), float(sigma[:, inside].max())
 
 
@@ -192,7 +192,9 @@ def test_slopes_of_the_search_are_those_of_the_singular_values(scenarios, critic
 
     values, slopes, in_band = search._linearised(point, reach=np.inf)
     np.testing.assert_allclose(values, log_sigma(point).ravel(), rtol=1e-9)
-    assert np.array_equal(in_band.reshape(-1, OMEGA.size)[0], [BAND_HZ[0] <= f <= BAND_HZ[1] for f in TUNING_HZ])
+    assert np.array_equal(
+        in_band.reshape(-1, OMEGA.size)[0], [BAND_HZ[0] <= f <= BAND_HZ[1] for f in SETTINGS.frequencies_Hz]
+    )
     for k, e in enumerate(np.eye(point.size)):
         numeric = (log_sigma(point + h * e) - log_sigma(point - h * e)).ravel() / (2 * h)
         np.testing.assert_allclose(slopes[:, k], numeric, atol=1e-4)

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from avis_ctrl import campaign
 from avis_ctrl.gap.analysis import analyse
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.simulation.campaign_data import ACCELEROMETER_AMPLIFIER_HZ
+from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
 from benchmarks.own_tables import tables
 from benchmarks.own_tables.campaign import Settings, write_campaign
 
@@ -29,7 +29,7 @@ def test_a_slow_amplifier_is_named_and_a_fast_one_is_no_effect(tmp_path, name, c
     table = replace(table, drives=tuple(replace(drive, corner_Hz=corner_Hz) for drive in table.drives))
     write_campaign(table, "multisine", tmp_path / "campaign.h5", seed=7, settings=SHORT)
     rig = load_rig(RIGS / f"{name}.toml")
-    found = analyse(campaign(tmp_path / "campaign.h5"), rig, amplifier_corner_Hz=ACCELEROMETER_AMPLIFIER_HZ)
+    found = analyse(campaign(tmp_path / "campaign.h5"), rig, amplifier_corner_Hz=CAMPAIGN.amplifier_corner_Hz)
     assert [one.name for one in found.effects] == (["actuator_lag"] if named else [])
     assert found.stages[-1].chi2_per_dof < 1.1
     if named:

@@ -16,7 +16,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, append, gain
 from avis_ctrl.robust.dscale_fit import fit_magnitude, stable_roots
 from avis_ctrl.robust.dscale_matrix import fit_hermitian
-from avis_ctrl.robust.dstep import CHECKED_POINTS, PointwiseScalings, d_steps, tightened
+from avis_ctrl.robust.dstep import SETTINGS, PointwiseScalings, d_steps, tightened
 from avis_ctrl.robust.scalings import MatrixScaling, ScalarScaling, Scalings
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexFull, ComplexScalar
 
@@ -275,7 +275,7 @@ def test_the_four_highest_peaks_between_the_points_become_points(added):
     C = np.kron(2 * zeta * np.array([[1.5, 1.4, 1.3, 1.2, 1.1, 0.5]]), [[1.0, 0.0], [1.0, 0.0]])
     N = StateSpace(A, B, C, np.full((2, 2), 0.1))
     structure = BlockStructure.of([ComplexFull(1, 1)]).with_performance(1, 1)
-    coarse, dense = np.geomspace(0.01, 1000, 16), np.geomspace(0.01, 1000, CHECKED_POINTS)
+    coarse, dense = np.geomspace(0.01, 1000, 16), np.geomspace(0.01, 1000, SETTINGS.checked)
     step = next(
         d_steps(PointwiseScalings.of(coarse, N.frequency_response(coarse), structure), N, Scalings.identity(structure))
     )

@@ -11,7 +11,8 @@ import pytest
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, append, connect, gain, hinf_norm, lft_lower, summing_junction, tf
 from avis_ctrl.robust.dstep import PointwiseScalings, equal_order_fits
-from avis_ctrl.robust.frequency_grid import MAX_POINTS, frequency_grid, merged, refined_grid
+from avis_ctrl.robust.frequency_grid import SETTINGS as GRID
+from avis_ctrl.robust.frequency_grid import frequency_grid, merged, refined_grid
 from avis_ctrl.robust.gamma_descent import (
     ScaledProblem,
     descend,
@@ -372,7 +373,7 @@ def test_a_grid_has_the_points_of_both_but_none_twice():
     one = np.geomspace(1.0, 100.0, 30)
     assert np.array_equal(merged(one, np.concatenate([1.05 * one, 1.0005 * one[::2]])), np.sort([*one, *(1.05 * one)]))
     many = merged(np.geomspace(1.0, 100.0, 300), one)
-    assert many.size == MAX_POINTS and many[0] == 1.0 and many[-1] == pytest.approx(100.0)
+    assert many.size == GRID.most_points and many[0] == 1.0 and many[-1] == pytest.approx(100.0)
 
 
 def test_the_grid_of_a_loop_sees_its_resonance_and_halves_around_peaks():
@@ -388,7 +389,7 @@ def test_the_grid_of_a_loop_sees_its_resonance_and_halves_around_peaks():
     # The end is none, of a plateau both ends are, and the lowest of the four stays.
     between = coarse[[1, 2, 3, 4, 5]] * 10**0.125
     assert np.allclose(np.setdiff1d(finer, coarse), between)
-    for points, room in ((MAX_POINTS - 2, True), (MAX_POINTS - 1, False)):
+    for points, room in ((GRID.most_points - 2, True), (GRID.most_points - 1, False)):
         many = np.geomspace(1.0, 1e4, points)
         assert refined_grid(many, np.exp(-(np.log(many / many[40]) ** 2))).size == points + 2 * room
 

@@ -17,7 +17,7 @@ from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.simulation.spectrum_check import POINTS_PER_LINE, REACH_LINES, welch_moments
+from avis_ctrl.simulation.spectrum_check import SETTINGS, welch_moments
 
 SILENT = {"ambient": {"velocity_rms_m_per_s": 0.0}, "sensors": {"noise": False, "quantiser": False}, "settle_s": 0.0}
 
@@ -139,13 +139,13 @@ def test_the_ambient_level_of_a_rest_record_is_the_predicted_spectrum():
     _, estimate = signal.welch(record.y, 1000.0, "hann", segment, axis=0)
     edges = (edges_Hz * 8).astype(int)
     lines, segments = edges[-1], 2 * len(record.y) // segment - 1
-    fine = np.arange(1, (lines + REACH_LINES) * POINTS_PER_LINE + 1) / 8.0 / POINTS_PER_LINE
+    fine = np.arange(1, (lines + SETTINGS.lines) * SETTINGS.points_per_line + 1) / 8.0 / SETTINGS.points_per_line
     tail = 1e-3 / (6 * 8) / 2
     for channel, psd in enumerate(np.pad(ambient_density(rig, fine), ((0, 0), (1, 0)))):
         mean, covariance = welch_moments(psd, segments)
         for lo, hi in pairwise(edges):
             variance = sum(
-                (1 if d == 0 else 2) * covariance[lo : hi - d, d].sum() for d in range(min(REACH_LINES, hi - lo))
+                (1 if d == 0 else 2) * covariance[lo : hi - d, d].sum() for d in range(min(SETTINGS.lines, hi - lo))
             )
             dof = 2 * mean[lo:hi].sum() ** 2 / variance
             ratio = estimate[lo:hi, channel].sum() / mean[lo:hi].sum()

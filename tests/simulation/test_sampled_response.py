@@ -8,7 +8,7 @@ import pytest
 from avis_ctrl.lti import StateSpace, gain, tf
 from avis_ctrl.rigs import COORDINATES
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.simulation.sampled_response import IMAGES, predict_transmissibility_6dof, sampled_response
+from avis_ctrl.simulation.sampled_response import SETTINGS, predict_transmissibility_6dof, sampled_response
 
 PERIOD = 4000
 TONES = {"x": [9, 40], "y": [11, 61], "z": [13, 83], "phi_x": [17, 101], "phi_y": [19, 160], "phi_z": [23, 290]}
@@ -66,7 +66,10 @@ def test_tones_through_the_nonlinear_loop_come_out_as_predicted(make_loop, name,
 def test_images_of_an_accelerometer_loop_converge(make_loop):
     loop, omega = make_loop("halcyonics_loaded"), 2 * np.pi * np.array([1.0, 10.0, 50.0, 100.0])
     far = sampled_response(loop, omega, 1000).velocity_floor
-    errors = [np.abs(sampled_response(loop, omega, n).velocity_floor - far).max() for n in (IMAGES, 4 * IMAGES)]
+    errors = [
+        np.abs(sampled_response(loop, omega, n).velocity_floor - far).max()
+        for n in (SETTINGS.images, 4 * SETTINGS.images)
+    ]
     assert errors[0] < 1e-3 * np.abs(far).max() and errors[1] < 0.3 * errors[0]
 
 

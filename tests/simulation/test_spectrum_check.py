@@ -10,7 +10,7 @@ from scipy import signal, stats
 from avis_ctrl.errors import InputError
 from avis_ctrl.simulation.design_check import check_designs
 from avis_ctrl.simulation.loop import simulate
-from avis_ctrl.simulation.spectrum_check import POINTS_PER_LINE, REACH_LINES, check_spectrum_agreement, welch_moments
+from avis_ctrl.simulation.spectrum_check import SETTINGS, check_spectrum_agreement, welch_moments
 
 ALL = ("x", "y", "z", "phi_x", "phi_y", "phi_z")
 
@@ -19,11 +19,11 @@ def test_white_noise_moments_are_the_textbook_ones():
     """Overlap correlation of Hann windows at 50 % is 16.7 % (Harris, Proc. IEEE 66 (1978), table 1), and its square
     enters the variance (Welch 1967); lines 1 and 2 apart have (2/3)^2 and (1/6)^2, the window being 1/2 - cos/2.
     """
-    mean, covariance = welch_moments(np.ones(60 * POINTS_PER_LINE), 11)
-    inner = slice(REACH_LINES, len(mean) - REACH_LINES)
+    mean, covariance = welch_moments(np.ones(60 * SETTINGS.points_per_line), 11)
+    inner = slice(SETTINGS.lines, len(mean) - SETTINGS.lines)
     assert mean[inner] == pytest.approx(1.0, rel=1e-4)
     assert covariance[inner, 0] == pytest.approx((1 + 2 * 10 / 11 / 36) / 11, rel=1e-4)
-    _, single = welch_moments(np.ones(60 * POINTS_PER_LINE), 1)
+    _, single = welch_moments(np.ones(60 * SETTINGS.points_per_line), 1)
     assert single[inner, 1] == pytest.approx(4 / 9, rel=1e-4)
     assert single[inner, 2] == pytest.approx(1 / 36, rel=1e-4)
     assert np.all(single[inner, 3:] < 1e-6)
@@ -38,7 +38,7 @@ def test_moments_of_a_narrow_resonance_agree_with_many_trials(rng):
     x = signal.lfilter([1.0], a, rng.standard_normal((trials, samples + 4000)), axis=1)[:, 4000:]
     band = slice(28, 34)
     power = signal.welch(x, 1.0, "hann", segment, segment // 2, detrend=False)[1][:, band].sum(axis=1)
-    f = np.arange(45 * POINTS_PER_LINE + 1) / POINTS_PER_LINE / segment
+    f = np.arange(45 * SETTINGS.points_per_line + 1) / SETTINGS.points_per_line / segment
     psd = 2 * np.abs(signal.freqz([1.0], a, 2 * np.pi * f)[1]) ** 2
     mean, covariance = welch_moments(psd, count)
     variance = sum((1 if d == 0 else 2) * covariance[28 : 34 - d, d].sum() for d in range(6))

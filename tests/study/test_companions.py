@@ -20,7 +20,7 @@ from avis_ctrl.study.companions import CompanionSettings, design_companions, unt
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
-from avis_ctrl.study.skyhooks import CUSTOMARY_CORNERS_HZ, classical_skyhook, critical_gains
+from avis_ctrl.study.skyhooks import SETTINGS, classical_skyhook, critical_gains
 
 RIG = Path(__file__).with_name("three_legs.toml")
 # Few candidates: the search is the same.
@@ -59,7 +59,7 @@ def companions(bare):
 @pytest.fixture(scope="module")
 def classical(bare):
     axes = ("x", "y", "phi_y", "phi_z")
-    loops = Skyhook(axes, critical_gains(bare.rig, axes), *CUSTOMARY_CORNERS_HZ)
+    loops = Skyhook(axes, critical_gains(bare.rig, axes), *SETTINGS.corners_Hz)
     return replace(bare, loops={axis: loops.loop(axis) for axis in axes})
 
 

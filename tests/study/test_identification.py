@@ -20,7 +20,12 @@ from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
 from avis_ctrl.study.identification_design import assumed_weights, design_start
-from avis_ctrl.study.identification_output import read_identified, write_identification, write_predictions
+from avis_ctrl.study.identification_output import (
+    PredictionSettings,
+    read_identified,
+    write_identification,
+    write_predictions,
+)
 from avis_ctrl.study.plan_file import default_plan
 
 FEW = IdentifyOptions(starts=1)
@@ -112,7 +117,7 @@ def test_a_long_record_is_predicted_piece_by_piece_as_in_one(rehearsal, found, t
     write_identification(found, tmp_path)
     one = rehearsal.campaign.only(("02",))
     write_predictions(tmp_path, one, tmp_path / "whole.h5")
-    monkeypatch.setattr("avis_ctrl.study.identification_output.PIECE", 3001)
+    monkeypatch.setattr("avis_ctrl.study.identification_output.SETTINGS", PredictionSettings(piece=3001))
     write_predictions(tmp_path, one, tmp_path / "pieces.h5")
     with h5py.File(tmp_path / "whole.h5") as whole, h5py.File(tmp_path / "pieces.h5") as pieces:
         y, again = whole["records/02/y"][:], pieces["records/02/y"][:]

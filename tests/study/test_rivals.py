@@ -22,7 +22,7 @@ from avis_ctrl.study.design_result import Bound, Candidate, ControllerResult
 from avis_ctrl.study.new_files import NewDesign, NewRig, new_design, rig_text
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.skyhooks import (
-    CUSTOMARY_CORNERS_HZ,
+    SETTINGS,
     SkyhookSettings,
     WorstCaseTuning,
     at_limits,
@@ -85,7 +85,7 @@ def test_lightly_damped_modes_are_not_taken_for_instability(light_table):
     search = WorstCaseTuning(plant, design, 2.0, SkyhookSettings()).search(rig)
     motion = search.scenarios.plant
     for factor in (0.3, 1.0, 2.5):
-        point = search.search.point(factor, CUSTOMARY_CORNERS_HZ)
+        point = search.search.point(factor, SETTINGS.corners_Hz)
         K = search.search.skyhook(search.axes, point).controller()
         for delta in search.scenarios.deltas[:, 0].real:
             assert lft_lower(lft_upper(motion.P, delta), K).is_stable()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.simulation.sampled_loop import lever_arms
-from avis_ctrl.study.analysis import PLOT_HZ
+from avis_ctrl.study.analysis import SETTINGS
 from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.plant import build_plant
@@ -32,7 +32,7 @@ def test_peaks_between_the_points_of_the_grid_are_found(band_Hz):
     asked = design.model_copy(
         update={"transmissibility": design.transmissibility.model_copy(update={"band_Hz": band_Hz})}
     )
-    omega = 2 * np.pi * PLOT_HZ
+    omega = 2 * np.pi * np.geomspace(*SETTINGS.plot_Hz, SETTINGS.plot_points)
     model = SimpleNamespace(omega=omega, sigma=by_hand(rig, omega))
     found = six_dof_check(
         asked, rig, build_plant(design, rig), SimpleNamespace(transmissibility=model, K=None), Companions(())
