@@ -30,8 +30,6 @@ from avis_ctrl.rigs.rig import Rig
 
 Progress = Callable[[str], None]
 Item = TypeVar("Item")
-# Levels within this factor count as one level.
-SAME_LEVEL = 1.25
 
 
 @dataclass(frozen=True)
@@ -53,6 +51,8 @@ class CampaignFitSettings:
         has a smaller fraction.
     floor_tail : the same for a measured floor: up to one or two per cent of its power is its sensor's noise, at all
         frequencies.
+    same_level : ratio up to which levels count as one [1]: 2 dB, less than a step between levels that are chosen to
+        differ.
     """
 
     longest_piece: int = 1 << 18
@@ -62,6 +62,7 @@ class CampaignFitSettings:
     quiet_band_Hz: tuple[float, float] = (0.5, 60.0)
     tail: float = 5e-4
     floor_tail: float = 0.02
+    same_level: float = 1.25
 
 
 SETTINGS = CampaignFitSettings()
@@ -114,7 +115,7 @@ def split_campaign(campaign: Campaign, hold_out: Sequence[str] | None = None) ->
 
 
 def of_one_level(items: Sequence[Item], kind_and_level: Callable[[Item], tuple[str, float]]) -> list[list[Item]]:
-    """Group items of one kind and level, within SAME_LEVEL of the lowest in a group; sorted by kind, then level.
+    """Group items of one kind and level, within `same_level` of the lowest in a group; sorted by kind, then level.
 
     kind_and_level : function that returns kind and level of an item.
     """
@@ -122,7 +123,7 @@ def of_one_level(items: Sequence[Item], kind_and_level: Callable[[Item], tuple[s
     for item in sorted(items, key=kind_and_level):
         kind, level = kind_and_level(item)
         first = kind_and_level(groups[-1][0]) if groups else None
-        if first and kind == first[0] and level <= SAME_LEVEL * first[1]:
+        if first and kind == first[0] and level <= SETTINGS.same_level * first[1]:
             groups[-1].append(item)
         else:
             groups.append([item])

@@ -22,9 +22,18 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import central_differences
 from avis_ctrl.rigs.rig import Rig
 
-# Directions that together change the response by less than this fraction, at every frequency, are not kept.
-NEGLIGIBLE = 1e-3
 KeptMatrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class DirectionSettings:
+    """negligible : change of the response by several directions together, at every frequency, below which they are
+    not kept [1]: cables, threads and glue change a response by as much from day to day."""
+
+    negligible: float = 1e-3
+
+
+SETTINGS = DirectionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +70,7 @@ def directions_that_matter(
     keep: Sequence[str],
     omega: np.ndarray,
     confidence: float = 0.95,
-    negligible: float = NEGLIGIBLE,
+    negligible: float = SETTINGS.negligible,
 ) -> Directions:
     """Minimum number of directions such that the rest changes the kept coordinates' response by less than `negligible`.
 

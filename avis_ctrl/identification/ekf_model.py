@@ -8,6 +8,7 @@ The state of Rademakers' filter (TU/e 2005, eq. 3.3) is (q, q', theta) with thet
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,16 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 
-# Relative nonlinearity of a matrix, when all parameters change by a fifth, that counts as round-off.
-LINEARITY = 1e-9
+
+@dataclass(frozen=True)
+class LinearModelSettings:
+    """linearity : nonlinearity of a matrix, relative to its largest entry, that counts as round-off when all
+    parameters change by a fifth [1]: a product of two parameters then deviates by a few per cent."""
+
+    linearity: float = 1e-9
+
+
+SETTINGS = LinearModelSettings()
 
 
 class LinearModel(NamedTuple):
@@ -119,7 +128,7 @@ def linear_model(
             raise InputError("M, C and K do not depend on this parameter", field="names", value=name)
     of_body = np.moveaxis(np.array(slopes[:3]), 1, -1)
     constant, moved = np.array(known[:3]) - of_body @ theta, np.array(model.at(1.2 * theta).matrices[:3])
-    size = LINEARITY * np.max(np.abs(moved), axis=(1, 2), keepdims=True)
+    size = SETTINGS.linearity * np.max(np.abs(moved), axis=(1, 2), keepdims=True)
     if np.any(np.abs(moved - constant - of_body @ (1.2 * theta)) > size):
         raise InputError(
             "M, C and K must be linear in the parameters of this filter; they are not linear in these",

@@ -9,7 +9,16 @@ from scipy.stats import chi2
 
 from avis_ctrl.identification.ekf_settings import EkfSettings
 
-LAGS = 50
+
+@dataclass(frozen=True)
+class InnovationSettings:
+    """lags : samples up to which innovations are correlated [1]; with six outputs these are 300 values, of which white
+    innovations have 5 +- 1.3 % beyond the bound."""
+
+    lags: int = 50
+
+
+SETTINGS = InnovationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +30,7 @@ class Innovations:
     ----------
     nis : mean over time of the normalised innovation squared e^T S^-1 e; expected n_y.
     nis_interval : interval that contains 99.9 % of such means (chi-square of n n_y degrees of freedom).
-    autocorrelation : (LAGS, n_y) at 1, 2, .. samples, each output separately.
+    autocorrelation : (lags, n_y) at 1, 2, .. samples, each output separately.
     bound : 1.96 / sqrt(n), within which 95 % of the autocorrelations of white noise lie.
     """
 
@@ -56,7 +65,7 @@ def innovation_statistics(innovation: np.ndarray) -> Innovations:
     n, n_y = innovation.shape
     low, high = chi2.ppf((0.0005, 0.9995), n * n_y) / n
     power = np.sum(innovation**2, axis=0)
-    lags = range(1, min(LAGS, n - 1) + 1)
+    lags = range(1, min(SETTINGS.lags, n - 1) + 1)
     with np.errstate(invalid="ignore"):
         correlation = np.array([np.einsum("ij,ij->j", innovation[k:], innovation[:-k]) / power for k in lags])
     return Innovations(

@@ -14,10 +14,17 @@ import scipy.fft
 from avis_ctrl.identification.identifiability_text import combination_text
 from avis_ctrl.identification.sparse_space import sparse_rows, whole_numbers
 from avis_ctrl.measurement.campaign import Campaign, ranges
-from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS
+from avis_ctrl.measurement.frequency_response.local_fit import SETTINGS as LOCAL_FIT
 
-# Samples read at once.
-PIECE = 1 << 18
+
+@dataclass(frozen=True)
+class ExcitedSpaceSettings:
+    """piece : samples read at once [1], to limit the memory: 2 MB a channel."""
+
+    piece: int = 1 << 18
+
+
+SETTINGS = ExcitedSpaceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +69,7 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
     names = campaign.u_names
     gram = np.zeros((len(names),) * 2)
     for record in campaign.records:
-        for start, stop in ranges(record.header.samples, PIECE):
+        for start, stop in ranges(record.header.samples, SETTINGS.piece):
             u = record.load(start, stop).u
             if not np.any(u):
                 continue
@@ -70,12 +77,12 @@ def excited_space(campaign: Campaign, band_Hz: tuple[float, float]) -> ExcitedSp
             U = scipy.fft.rfft(u, axis=0)[(f >= band_Hz[0]) & (f <= band_Hz[1]) & (f > 0)]
             gram += np.real(U.conj().T @ U)
     size = np.sqrt(np.diag(gram))
-    driven = np.flatnonzero(size > SETTINGS.span_tolerance * np.max(size, initial=0.0))
+    driven = np.flatnonzero(size > LOCAL_FIT.span_tolerance * np.max(size, initial=0.0))
     if not driven.size or not np.any(size):
         return ExcitedSpace(names, (), np.zeros((0, 0)))
     size = size[driven]
     values, vectors = np.linalg.eigh(gram[np.ix_(driven, driven)] / np.outer(size, size))
-    missing = vectors[:, values < SETTINGS.span_tolerance**2]
+    missing = vectors[:, values < LOCAL_FIT.span_tolerance**2]
     # w with w^T u = 0: in volts the entries are divided by the sizes.
     rows = [whole_numbers(row) for row in sparse_rows(missing / size[:, None], 1e-4)] if missing.size else []
     return ExcitedSpace(names, tuple(names[j] for j in driven), np.reshape(rows, (-1, len(driven))))

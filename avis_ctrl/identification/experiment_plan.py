@@ -16,12 +16,26 @@ from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.structure import structural_null_space, structure_of
 
-_FLOOR_SHAKEN = 1e-4
-_BENCH = 0.02
 CAUTION = (
     "These predictions include noise only: added masses, changed positions and added channels count as exactly "
     "known, and the model as correct."
 )
+
+
+@dataclass(frozen=True)
+class ExperimentPlanSettings:
+    """Size of the proposed experiments.
+
+    floor_m_per_s : r.m.s. velocity of a shaken floor [m/s], fifty times that of a quiet laboratory.
+    bench : relative standard deviation of a mount's stiffness or damping measured on a test bench [1]: force and
+        travel are each known to a per cent.
+    """
+
+    floor_m_per_s: float = 1e-4
+    bench: float = 0.02
+
+
+SETTINGS = ExperimentPlanSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +107,8 @@ Predictions = list[tuple[Experiment, Information]]
 def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     """Experiments that are usually possible with a table; `drive` is the present record.
 
-    Masses are 10 % of the payload, attachments move by 50 mm, the floor is shaken with 0.1 mm/s r.m.s. and measured, a
-    single mount on a test bench is known to 2 %. Sensors and actuators are added on the payload: a sensor on the
+    Masses are 10 % of the payload, attachments move by 50 mm, the floor is shaken and measured, single mounts are
+    measured on a test bench (`ExperimentPlanSettings`). Sensors and actuators are added on the payload: a sensor on the
     chassis measures the floor, which is a separate candidate.
     """
     low, high = drive.band_Hz
@@ -123,8 +137,9 @@ def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     for axis in FLOOR:
         found.append(
             Experiment(
-                f"Shake the floor along {axis[-1]} (0.1 mm/s r.m.s.) and measure its velocity",
-                replace(drive, level_V=0.0, floor_m_per_s={axis: _FLOOR_SHAKEN}),
+                f"Shake the floor along {axis[-1]} ({number(1e3 * SETTINGS.floor_m_per_s)} mm/s r.m.s.) "
+                "and measure its velocity",
+                replace(drive, level_V=0.0, floor_m_per_s={axis: SETTINGS.floor_m_per_s}),
             )
         )
     return (*found, *_changed_rigs(model, drive), *_more_channels(model, drive), *_bench(model))
@@ -190,7 +205,8 @@ def _bench(model: ResponseModel) -> list[Experiment]:
     if mounts:
         found.append(
             Experiment(
-                f"Measure single mounts on a bench, to 2 % each: {listed(mounts)}", bench=dict.fromkeys(mounts, _BENCH)
+                f"Measure single mounts on a bench, to {number(100 * SETTINGS.bench)} % each: {listed(mounts)}",
+                bench=dict.fromkeys(mounts, SETTINGS.bench),
             )
         )
     if "mass" in model.names:

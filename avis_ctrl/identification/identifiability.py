@@ -17,12 +17,21 @@ from avis_ctrl.identification.identifiability_text import (
     weak_direction_sentence,
     weak_sentence,
 )
-from avis_ctrl.identification.information import UNDETERMINED, Combination, Information
+from avis_ctrl.identification.information import SETTINGS as INFORMATION
+from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.response import ResponseModel, size_of
 from avis_ctrl.identification.structure import Structure, structural_null_space, structure_of
 
-# Relative standard deviation above which a combination is called weak.
-WEAK = 0.05
+
+@dataclass(frozen=True)
+class IdentifiabilitySettings:
+    """weak : relative standard deviation above which a combination is called weak [1]: scales and data sheets are as
+    good."""
+
+    weak: float = 0.05
+
+
+SETTINGS = IdentifiabilitySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +111,7 @@ def _left_dark(information: Information, null: np.ndarray) -> np.ndarray:
     inside = null.T @ information.relative @ null
     values, vectors = np.linalg.eigh((inside + inside.T) / 2)
     floor = 4 * len(null) * np.finfo(float).eps * np.max(np.linalg.eigvalsh(information.relative))
-    return null @ vectors[:, values <= max(1 / UNDETERMINED**2, floor)]
+    return null @ vectors[:, values <= max(1 / INFORMATION.undetermined**2, floor)]
 
 
 def _combinations(information: Information, structure: Structure) -> tuple[Combination, ...]:
@@ -179,12 +188,12 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
             f"value itself): {', '.join(one.words for one in poor)}."
         )
     weak = sorted(
-        (one for one in combinations if one.determined and one.relative > WEAK), key=lambda one: -one.relative
+        (one for one in combinations if one.determined and one.relative > SETTINGS.weak), key=lambda one: -one.relative
     )
     said += [weak_sentence(one) for one in weak]
     sigma, V = information.directions
     last = information.rank - 1
-    if last >= 0 and sigma[last] > WEAK:
+    if last >= 0 and sigma[last] > SETTINGS.weak:
         said.append(weak_direction_sentence(names, V[:, last], float(sigma[last])))
     return tuple(said)
 

@@ -11,10 +11,20 @@ import numpy as np
 from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 
-# A direction with a larger standard deviation, relative to the parameters' size, is not determined.
-UNDETERMINED = 1.0
-# Fraction of a combination that may lie in directions without any information: their rotation by round-off.
-ROUNDED = 1e-3
+
+@dataclass(frozen=True)
+class InformationSettings:
+    """undetermined : standard deviation of a direction, relative to the parameters' size, from which it is not
+        determined [1]: then not even the sign is known.
+    rounded : fraction of a combination that may lie in directions without any information [1]: their rotation by
+        round-off is smaller.
+    """
+
+    undetermined: float = 1.0
+    rounded: float = 1e-3
+
+
+SETTINGS = InformationSettings()
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,7 @@ class Information:
     @cached_property
     def determined(self) -> np.ndarray:
         """(n_p,) which of the directions the data determine."""
-        return self.directions[0] < UNDETERMINED
+        return self.directions[0] < SETTINGS.undetermined
 
     @cached_property
     def null_space(self) -> np.ndarray:
@@ -147,7 +157,7 @@ class Information:
         size = float(np.linalg.norm(relative))
         along, dark = V.T @ relative, np.isinf(sigma)
         spread = float(np.linalg.norm(along[~dark] * sigma[~dark]))
-        lost = np.linalg.norm(along[dark]) > ROUNDED * size or spread >= UNDETERMINED * size
+        lost = np.linalg.norm(along[dark]) > SETTINGS.rounded * size or spread >= SETTINGS.undetermined * size
         return float(w @ self.values), np.inf if lost else spread
 
     def plus(self, other: Information) -> Information:

@@ -8,7 +8,7 @@ frequency, as the local polynomial requires.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,8 +21,17 @@ from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 
-# Lines to each side of a window; None for the minimum that the degrees of freedom allow.
-HALF_WIDTHS = (None, 16, 24, 36)
+
+@dataclass(frozen=True)
+class ModelErrorSettings:
+    """half_widths : lines to each side of a window, tried in this order; None for the minimum that the degrees of
+    freedom allow. Each is about half as wide again as the one before, so that the window is hardly
+    wider than the inputs need to be separated."""
+
+    half_widths: tuple[int | None, ...] = (None, 16, 24, 36)
+
+
+SETTINGS = ModelErrorSettings()
 
 
 class Unexplained(RecordSource):
@@ -93,7 +102,7 @@ def _local(
     campaign: Campaign, band_Hz: tuple[float, float], longest_piece: int | None, frequency_Hz: np.ndarray | None
 ) -> FrequencyResponse:
     # Directions that the records do not excite at all are missing in windows of any width.
-    widths = HALF_WIDTHS if excited_space(campaign, band_Hz).full else HALF_WIDTHS[:1]
+    widths = SETTINGS.half_widths if excited_space(campaign, band_Hz).full else SETTINGS.half_widths[:1]
     for half_width in widths:
         try:
             return local_polynomial(

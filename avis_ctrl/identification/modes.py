@@ -31,12 +31,24 @@ from avis_ctrl.identification.response import N_Q, ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-# Minimum fraction of the mode's kinetic energy for a coordinate to be named.
-NAMED_SHARE = 0.05
-# The fit extends from this fraction of the lowest mode to this multiple of the highest, over at most so many lines.
-REACH, MOST_LINES = (0.5, 3.0), 30_000
-# Minimum number of real data per unknown.
-FEWEST_PER_UNKNOWN = 2.0
+
+@dataclass(frozen=True)
+class ModeSettings:
+    """named_share : minimum fraction of the mode's kinetic energy for a coordinate to be named [1]; smaller ones do not
+        characterise a shape.
+    reach : band of the fit of measured modes, relative to the lowest and to the highest mode [1]; further away the
+        response hardly depends on the poles.
+    most_lines : maximum number of lines of that fit, to limit memory and time.
+    fewest_per_unknown : minimum number of real data per unknown [1]; with fewer, the misfit would be known poorly.
+    """
+
+    named_share: float = 0.05
+    reach: tuple[float, float] = (0.5, 3.0)
+    most_lines: int = 30_000
+    fewest_per_unknown: float = 2.0
+
+
+SETTINGS = ModeSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +150,7 @@ def _in_words(M: np.ndarray, x: np.ndarray) -> str:
     share = np.real(np.conj(x) * (M @ x))
     share = share / share.sum()
     order = np.argsort(-share)
-    others = [f"{COORDINATES[i]} {100 * share[i]:.0f} %" for i in order[1:] if share[i] >= NAMED_SHARE]
+    others = [f"{COORDINATES[i]} {100 * share[i]:.0f} %" for i in order[1:] if share[i] >= SETTINGS.named_share]
     return COORDINATES[order[0]] + (f" with {', '.join(others)}" if others else "")
 
 
@@ -181,11 +193,11 @@ def measured_modes(blocks: Sequence[SpectralBlock], model: ResponseModel) -> Mea
     """
     start = model_modes(model)
     model, blocks = _of_one_kind(model, blocks)
-    low, high = REACH[0] * start.frequency_Hz[0], REACH[1] * start.frequency_Hz[-1]
+    low, high = SETTINGS.reach[0] * start.frequency_Hz[0], SETTINGS.reach[1] * start.frequency_Hz[-1]
     kept: list[SpectralBlock] = []
     for block in blocks:
         near = (block.omega >= 2 * np.pi * low) & (block.omega <= 2 * np.pi * high)
-        if np.any(near) and sum(len(b.omega) for b in kept) + near.sum() <= MOST_LINES:
+        if np.any(near) and sum(len(b.omega) for b in kept) + near.sum() <= SETTINGS.most_lines:
             kept.append(block.lines(near))
     problem = _Poles(kept, model, len(start.damping))
     x = np.concatenate([np.log(start.frequency_Hz), np.log(np.maximum(start.damping, 1e-4))])
@@ -260,7 +272,7 @@ class _Poles:
         self.through = np.hstack([np.concatenate([part[4] for part in parts]), la.block_diag(*[p[5] for p in parts])])
         self.beside = np.hstack([np.concatenate([part[6] for part in parts]), la.block_diag(*[p[7] for p in parts])])
         columns = 2 * modes * self.through.shape[1] + self.beside.shape[1]
-        if 2 * len(self.omega) < FEWEST_PER_UNKNOWN * columns:
+        if 2 * len(self.omega) < SETTINGS.fewest_per_unknown * columns:
             raise ComputationError(
                 "the modes cannot be measured without the rig's equations",
                 measured=f"{2 * len(self.omega)} numbers per output for {columns} unknown residues",

@@ -16,6 +16,7 @@ reduces the precision of the average, not its validity.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +27,26 @@ from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.response import FrequencyModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
-# Half the band [Hz] over which S and d are taken as constant, minimum lines in it, and iterations of their fit.
-SHAPE_HALF_Hz, SHAPE_LINES, ROUNDS = 0.25, 40, 30
-# Minimum half band [Hz] and degrees of freedom of an average: an estimate with dof of them costs n_y / dof of the
-# precision that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
-HALF_Hz, LEAST_DOF = 0.15, 100
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """shape_half_Hz : half the band over which S and d are taken as constant [Hz]; spectra of floors and sensors are
+        smooth over such a band.
+    shape_lines : minimum lines in it; S and d have 15 unknowns for six outputs.
+    rounds : iterations of their fit. The average corrects what they leave.
+    half_Hz : minimum half band of an average [Hz], narrow enough for what the shape leaves of a resonance.
+    least_dof : minimum degrees of freedom of an average: an estimate with dof of them costs n_y / dof of the precision
+        that the noise would allow (Pintelon and Schoukens 2012, section 12.3).
+    """
+
+    shape_half_Hz: float = 0.25
+    shape_lines: int = 40
+    rounds: int = 30
+    half_Hz: float = 0.15
+    least_dof: int = 100
+
+
+SETTINGS = NoiseSettings()
 
 
 def relative_noise(blocks: Sequence[SpectralBlock], fraction: float = 0.1) -> list[SpectralBlock]:
@@ -52,7 +68,7 @@ def noise_from_residuals(
 ) -> list[SpectralBlock]:
     """Blocks with the covariance of a model's residuals near their lines, averaged over records of a kind.
 
-    At each line the window grows until the covariance has LEAST_DOF degrees of freedom, and three for each output:
+    At each line the window grows until the covariance has `least_dof` degrees of freedom, and three for each output:
     thinned records have few lines far from resonances.
 
     Raises
@@ -67,9 +83,9 @@ def noise_from_residuals(
             raise InputError(f"expected residuals of its kind, {kind}", field=f"block {own[0].name}")
         shape = _shape(pool, model)
         flat = [_outer(np.linalg.solve(shape.factor(one.block.omega, model), one.error)) for one in pool]
-        least = max(LEAST_DOF, 3 * own[0].Y.shape[1])
+        least = max(SETTINGS.least_dof, 3 * own[0].Y.shape[1])
         for block in own:
-            half = np.maximum(HALF_Hz * 2 * np.pi, _reach(pool, block.omega, least))
+            half = np.maximum(SETTINGS.half_Hz * 2 * np.pi, _reach(pool, block.omega, least))
             total, count = _window_sums(pool, flat, block.omega, half)
             A = shape.factor(block.omega, model)
             noise = A @ (total / np.maximum(count, 1)[:, None, None]) @ _adjoint(A)
@@ -101,13 +117,13 @@ class _Shape(NamedTuple):
 
 def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     """S and d fitted to residuals, with windows on a grid of half their width."""
-    half = max(2 * np.pi * SHAPE_HALF_Hz, SHAPE_LINES / _density(pool) / 2)
+    half = max(2 * np.pi * SETTINGS.shape_half_Hz, SETTINGS.shape_lines / _density(pool) / 2)
     low, high = min(one.block.omega[0] for one in pool), max(one.block.omega[-1] for one in pool)
     grid = np.linspace(low, high, max(int(np.ceil((high - low) / half)) + 1, 2))
     G = [_floor_response(model, one.block.omega) for one in pool]
     R = [_outer(one.error) for one in pool]
     m = [one.error.shape[2] for one in pool]
-    reach = np.maximum(half, _reach(pool, grid, SHAPE_LINES))
+    reach = np.maximum(half, _reach(pool, grid, SETTINGS.shape_lines))
     total, count = _window_sums(pool, R, grid, reach)
     mean = _lifted(total / np.maximum(count, 1)[:, None, None])
     # The quietest directions contain no floor motion; the excess of the others is the floor's, equal on three axes.
@@ -115,7 +131,7 @@ def _shape(pool: Sequence[Residual], model: FrequencyModel) -> _Shape:
     gain = np.interp(grid, pool[0].block.omega, np.sum(np.abs(G[0]) ** 2, axis=(1, 2)))
     loud = np.real(np.einsum("nii->n", mean)) / gain
     shape = _Shape(grid, loud[:, None, None] * np.eye(3, dtype=complex), np.repeat(quiet[:, None], mean.shape[1], 1))
-    for _ in range(ROUNDS):
+    for _ in range(SETTINGS.rounds):
         parts = [_expected(g, r, k, *shape.at(one.block.omega)) for g, r, k, one in zip(G, R, m, pool, strict=True)]
         S, count = _window_sums(pool, [part[0] for part in parts], grid, reach)
         d, _ = _window_sums(pool, [part[1] for part in parts], grid, reach)

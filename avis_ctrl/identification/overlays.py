@@ -9,7 +9,7 @@ import numpy as np
 from avis_ctrl.checks import places
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
-from avis_ctrl.identification.campaign_fit import SETTINGS
+from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.spread import kept_axes
 from avis_ctrl.measurement.campaign import Campaign, Portion
@@ -17,8 +17,15 @@ from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
-# Number of frequencies in a figure.
-POINTS = 400
+
+@dataclass(frozen=True)
+class OverlaySettings:
+    """points : maximum number of frequencies in a figure; more are not visible, and each costs a local fit."""
+
+    points: int = 400
+
+
+SETTINGS = OverlaySettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +147,9 @@ def measured_response(
         low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
         if not 0 < low < high:
             raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz) from None
-        points = min(POINTS, round((high - low) / step) + 1)
+        points = min(SETTINGS.points, round((high - low) / step) + 1)
         grid = np.clip(np.geomspace(low, high, points), low, high)
-        return model_error.measured_response(_wholes(data), model, band_Hz, SETTINGS.longest_piece, grid)
+        return model_error.measured_response(_wholes(data), model, band_Hz, FIT.longest_piece, grid)
 
 
 def _wholes(data: Campaign) -> Campaign:
@@ -154,6 +161,7 @@ def _wholes(data: Campaign) -> Campaign:
 def thinned(response: FrequencyResponse) -> FrequencyResponse:
     """Few enough lines for a figure, evenly spaced in logarithm."""
     f = response.frequency_Hz
-    if f.size <= POINTS:
+    if f.size <= SETTINGS.points:
         return response
-    return response.at(np.unique(np.clip(np.searchsorted(f, np.geomspace(f[0], f[-1], POINTS)), 0, f.size - 1)))
+    wanted = np.geomspace(f[0], f[-1], SETTINGS.points)
+    return response.at(np.unique(np.clip(np.searchsorted(f, wanted), 0, f.size - 1)))

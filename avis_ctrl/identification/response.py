@@ -40,8 +40,17 @@ _POWER: dict[str, int] = {"displacement": 0, "velocity": 1, "acceleration": 2}
 N_Q = 6
 Model = TypeVar("Model")
 Value = TypeVar("Value")
-# Lower bound of a positive parameter in a fit, as a fraction of its size at the start.
-LOWEST = 1e-6
+
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """lowest : lower bound of a positive parameter in a fit, relative to its size at the start [1]: just above zero,
+    where the matrices are still regular."""
+
+    lowest: float = 1e-6
+
+
+SETTINGS = ResponseSettings()
 
 
 @lru_cache(maxsize=32)
@@ -535,8 +544,8 @@ class ResponseModel:
         return size_of(self.values)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n_p,) lower and upper bounds in a fit that starts here: LOWEST times its size for a positive parameter."""
-        low = np.where([positive(name) for name in self.names], LOWEST * self.scales(), -np.inf)
+        """(n_p,) lower and upper bounds in a fit that starts here: `lowest` times its size if positive."""
+        low = np.where([positive(name) for name in self.names], SETTINGS.lowest * self.scales(), -np.inf)
         return low, np.full(len(low), np.inf)
 
     def reach(self) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ it ends.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -20,10 +20,18 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Portion, RecordSource, ranges
 
-# Samples processed at once.
-PIECE = 1 << 17
-# Twice the logarithm of the odds, 19 to 1, that the records must give against the model's own turning.
-EVIDENCE = 2 * np.log(19.0)
+
+@dataclass(frozen=True)
+class SecondOrderSettings:
+    """piece : samples processed at once [1], to limit the memory: 1 MB a channel.
+    odds : odds to one that the records must give against the model's own turning [1]: a confidence of 95 %.
+    """
+
+    piece: int = 1 << 17
+    odds: float = 19.0
+
+
+SETTINGS = SecondOrderSettings()
 
 
 def terms(
@@ -55,9 +63,10 @@ def _of_record(
     for block in blocks:
         start = round((block.start_s - whole.header.start_s) * fs)
         # The inputs between two pieces move the table, too.
-        for first, last in ranges(start - at, PIECE) if start - at > 1 else ():
+        for first, last in ranges(start - at, SETTINGS.piece) if start - at > 1 else ():
             _read(whole, at + first, at + last, predictors)
-        parts = [_read(whole, start + first, start + last, predictors) for first, last in ranges(block.samples, PIECE)]
+        pieces = ranges(block.samples, SETTINGS.piece)
+        parts = [_read(whole, start + first, start + last, predictors) for first, last in pieces]
         at = start + block.samples
         y = np.concatenate(parts, axis=1)
         lines = np.rint(block.omega * block.samples / (2 * np.pi * fs)).astype(int)
@@ -84,7 +93,7 @@ def chosen_turning(
     """What turns with the payload according to blocks with noise, and the corresponding terms (n, n_y, 1) of each
     block.
 
-    The model's own turning is replaced only if the records favour another by 19 to 1.
+    The model's own turning is replaced only if the records favour another by `odds` to 1.
     """
     ways = (Turning(0.0, 0.0), Turning(1.0, 0.0), Turning(0.0, 1.0))
     parts = terms(campaign, blocks, model, ways)
@@ -97,6 +106,6 @@ def chosen_turning(
         return float(share @ H @ share - 2 * g @ share)
 
     best = min((Turning(a, b) for a in (0.0, 1.0) for b in (0.0, 1.0)), key=chi2)
-    if chi2(model.turning) - chi2(best) < EVIDENCE:
+    if chi2(model.turning) - chi2(best) < 2 * np.log(SETTINGS.odds):
         best = model.turning
     return best, [np.tensordot(np.array([1.0, *best]), one, axes=1) for one in columns]

@@ -11,13 +11,22 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 import scipy.linalg as la
 from scipy.sparse.csgraph import connected_components
 
-_MOST_CIRCUITS = 3000
+
+@dataclass(frozen=True)
+class SparseSpaceSettings:
+    """most_circuits : candidates for circuits of a part, above which its echelon form is used; each takes 0.1 ms."""
+
+    most_circuits: int = 3000
+
+
+SETTINGS = SparseSpaceSettings()
 
 
 def reduced_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
@@ -59,7 +68,7 @@ def sparse_rows(basis: np.ndarray, tolerance: float = 1e-6) -> np.ndarray:
 
 def _circuits(part: np.ndarray, tolerance: float) -> np.ndarray:
     d, n = part.shape
-    if d == 1 or math.comb(n, d - 1) > _MOST_CIRCUITS:
+    if d == 1 or math.comb(n, d - 1) > SETTINGS.most_circuits:
         return part / np.max(np.abs(part), axis=1, keepdims=True)
     candidates = []
     orthonormal = np.linalg.qr(part.T)[0]

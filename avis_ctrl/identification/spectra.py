@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
@@ -15,10 +16,20 @@ from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.response import SETTINGS as SPAN
 
-# Lines of a record on which models are compared.
-THIN_LINES = 450
-# Frequency [Hz] below which the resonances of a table lie: there all lines have the full weight in a selection.
-DENSE_BELOW_Hz = 8.0
+
+@dataclass(frozen=True)
+class SpectraSettings:
+    """dense_below_Hz : frequency below which all lines have the full weight in a selection [Hz]: the resonances of a
+        table are there.
+    dependent : relative singular value of unit columns below which a direction is dropped [1]: states with columns this
+        close are one. Its square, an eigenvalue of the Gram matrix, must be well above round-off.
+    """
+
+    dense_below_Hz: float = 8.0
+    dependent: float = 1e-6
+
+
+SETTINGS = SpectraSettings()
 
 
 def record_block(record: Record, model: ResponseModel, band_Hz: tuple[float, float]) -> SpectralBlock:
@@ -160,11 +171,6 @@ def transient_parts(
     return body, true[n_b + chains :]
 
 
-# Relative singular value of unit columns below which a direction is dropped: states with columns this close are one.
-# Its square, an eigenvalue of the Gram matrix, must be well above round-off.
-DEPENDENT = 1e-6
-
-
 def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Q (N, r) orthonormal and X (n_t, r) with columns (N, n_t) X = Q; dependent directions are omitted.
 
@@ -173,14 +179,14 @@ def span(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     # By the Gram matrix, twice because of round-off: in a third of the time of Householder QR.
     squares, V = np.linalg.eigh(columns.T @ columns)
-    kept = squares > DEPENDENT**2 * squares[-1]
+    kept = squares > SETTINGS.dependent**2 * squares[-1]
     X = V[:, kept] / np.sqrt(squares[kept])
     Q = columns @ X
     again = np.linalg.inv(np.linalg.cholesky(Q.T @ Q)).T
     return Q @ again, X @ again
 
 
-def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> SpectralBlock:
+def thinned(block: SpectralBlock, lines: int, seed: int = 0) -> SpectralBlock:
     """Subset of the lines of a block: preferably driven lines, dense where the resonances are, thinned out above."""
     n = len(block.omega)
     if n <= lines:
@@ -189,7 +195,8 @@ def thinned(block: SpectralBlock, lines: int = THIN_LINES, seed: int = 0) -> Spe
     power = np.sum(np.abs(block.U) ** 2, axis=(1, 2))
     driven = power > 1e-3 * np.max(power)
     frequency = block.omega / (2 * np.pi)
-    # Equal numbers per octave above DENSE_BELOW_Hz, equal weights below it.
-    weight = np.where(frequency < DENSE_BELOW_Hz, 1.0, DENSE_BELOW_Hz / frequency) * np.where(driven, 1.0, 0.05)
+    # Equal numbers per octave above `dense_below_Hz`, equal weights below it.
+    dense = SETTINGS.dense_below_Hz
+    weight = np.where(frequency < dense, 1.0, dense / frequency) * np.where(driven, 1.0, 0.05)
     keep = np.argsort(rng.exponential(size=n) / weight)[:lines]
     return block.lines(np.sort(keep))

@@ -28,11 +28,20 @@ from avis_ctrl.measurement.frequency_response.response import SETTINGS as SPAN
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.rig import Rig
 
-# Random draws for the quantiles; the 99 % quantile then depends on the 20 largest.
-DRAWS = 2000
-CONFIDENCES = (0.8, 0.9, 0.95, 0.99)
-# Lines processed at once, to limit the memory.
-CHUNK = 200
+
+@dataclass(frozen=True)
+class FrfSpreadSettings:
+    """draws : random draws for the quantiles; the 99 % quantile then depends on the 20 largest.
+    confidences : probabilities of the bounds [1]: the usual ones, of which a design chooses.
+    chunk : lines processed at once, to limit the memory: 26 MB for two coordinates.
+    """
+
+    draws: int = 2000
+    confidences: tuple[float, ...] = (0.8, 0.9, 0.95, 0.99)
+    chunk: int = 200
+
+
+SETTINGS = FrfSpreadSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +121,7 @@ def frf_spread(
     measured: FrequencyResponse,
     model: ResponseModel,
     keep: Sequence[str] = ("z", "phi_x"),
-    confidences: Sequence[float] = CONFIDENCES,
+    confidences: Sequence[float] = SETTINGS.confidences,
     seed: int = 1,
 ) -> FrfSpread:
     """Spread of a measured frequency response about an identified model.
@@ -230,16 +239,16 @@ def _covariance(
 
 def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float], seed: int) -> np.ndarray:
     """(c, n) quantiles of the largest singular value of (k, k) matrices of that covariance, estimated with `dof`."""
-    rng = np.random.default_rng(seed)
-    Z = (rng.standard_normal((DRAWS, k * k)) + 1j * rng.standard_normal((DRAWS, k * k))) / np.sqrt(2)
+    rng, draws, chunk = np.random.default_rng(seed), SETTINGS.draws, SETTINGS.chunk
+    Z = (rng.standard_normal((draws, k * k)) + 1j * rng.standard_normal((draws, k * k))) / np.sqrt(2)
     if np.isfinite(dof):
         # The covariance was estimated: the ratio has an F instead of a chi-square distribution.
-        Z /= np.sqrt(rng.gamma(dof, 1 / dof, (DRAWS, 1)))
+        Z /= np.sqrt(rng.gamma(dof, 1 / dof, (draws, 1)))
     values, vectors = np.linalg.eigh((covariance + np.conj(np.swapaxes(covariance, 1, 2))) / 2)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     found = []
-    for start in range(0, len(root), CHUNK):
+    for start in range(0, len(root), chunk):
         # (n, draws, column, row) of the error.
-        N = (Z @ np.swapaxes(root[start : start + CHUNK], 1, 2)).reshape(-1, DRAWS, k, k)
+        N = (Z @ np.swapaxes(root[start : start + chunk], 1, 2)).reshape(-1, draws, k, k)
         found.append(np.quantile(largest_singular_value(N), confidences, axis=1))
     return np.concatenate(found, axis=1)

@@ -18,8 +18,16 @@ import scipy.linalg as la
 from avis_ctrl.identification.response import ResponseModel, size_of
 from avis_ctrl.identification.sparse_space import components, reduced_rows, sparse_rows, whole_numbers
 
-# The derivative is exact to about 1e-12; a singular value below this, relative to the largest, counts as zero.
-_ZERO = 1e-9
+
+@dataclass(frozen=True)
+class StructureSettings:
+    """zero : singular value, relative to the largest, below which it counts as zero [1]; the derivative is exact to
+    about 1e-12."""
+
+    zero: float = 1e-9
+
+
+SETTINGS = StructureSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,14 +79,14 @@ def structural_null_space(model: ResponseModel, floor: bool = False) -> np.ndarr
     J = (found.dY / np.where(level > 0, level, 1.0)).reshape(len(model.names), -1)
     J = np.concatenate([J.real, J.imag], axis=1) * model.scales()[:, None]
     norm = np.linalg.norm(J, axis=1)
-    acting = norm > _ZERO * norm.max(initial=0.0)
+    acting = norm > SETTINGS.zero * norm.max(initial=0.0)
     unit = J / np.where(acting, norm, 1.0)[:, None]
     unit[~acting] = 0.0
     # The singular values and left singular vectors of the wide matrix are those of this small factor.
     small = np.asarray(np.linalg.qr(unit.T, mode="r")).T
     left, sizes, _ = np.linalg.svd(small)
     sizes = np.concatenate([sizes, np.zeros(len(unit) - len(sizes))])
-    null = left[:, sizes <= _ZERO * sizes.max(initial=0.0)] / np.where(acting, norm, 1.0)[:, None]
+    null = left[:, sizes <= SETTINGS.zero * sizes.max(initial=0.0)] / np.where(acting, norm, 1.0)[:, None]
     return la.orth(null) if null.size else null
 
 

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.identification.campaign_fit import SETTINGS, CampaignFit, measured_noise
+from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
+from avis_ctrl.identification.campaign_fit import CampaignFit, measured_noise
 from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
@@ -28,8 +29,15 @@ from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 
-# Probability of the intervals.
-LEVEL = 0.95
+
+@dataclass(frozen=True)
+class ValidationSettings:
+    """level : probability of the intervals of chi-square [1]: the usual one."""
+
+    level: float = 0.95
+
+
+SETTINGS = ValidationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +184,7 @@ def _blocks(
         return [(response_block(held_out.between(*found.band_Hz), model, "held-out lines"), None)]
     blocks: list[tuple[SpectralBlock, RecordSource | None]] = []
     for record in held_out.records:
-        for k, piece in enumerate(record.pieces(max(SETTINGS.longest_piece, record.header.period_samples or 0))):
+        for k, piece in enumerate(record.pieces(max(FIT.longest_piece, record.header.period_samples or 0))):
             block = record_block(piece, model, found.band_Hz)
             if np.any(block.U):
                 whole = k == 0 and not (isinstance(record, Portion) and record.start > 0)
@@ -251,7 +259,7 @@ def _figures(
         raise InputError(
             "expected outputs that are not zero", field=f"held-out record {block.name}", value=power.tolist()
         )
-    of_output = [interval(expected, dof, noise_dof / len(power), LEVEL) for dof in error.output_dof]
+    of_output = [interval(expected, dof, noise_dof / len(power), SETTINGS.level) for dof in error.output_dof]
     floor = error.noise_share()
     white = whiteness(error, model.sensors.names, model.inputs, covariance, noise_dof / (2 * len(power)), families)
     return HeldOut(
@@ -259,7 +267,7 @@ def _figures(
         len(block.omega),
         words,
         error.chi2 / error.dof,
-        interval(expected, error.dof, noise_dof, LEVEL),
+        interval(expected, error.dof, noise_dof, SETTINGS.level),
         before.chi2 / before.dof,
         _local_chi2(found, fitted, raw, notes),
         error.output_chi2 / error.output_dof,

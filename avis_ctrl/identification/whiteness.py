@@ -23,11 +23,25 @@ import numpy as np
 
 from avis_ctrl.identification.prediction_error import PredictionError
 
-# Probability of at least one false alarm, and maximum lags: lines; steps of 1/bandwidth.
-FAMILY = 0.01
-LINE_LAGS, TIME_LAGS, NEGATIVE_LAGS = 20, 100, 10
-# Fraction of the power of the strongest input below which an input counts as silent.
-SILENT = 1e-12
+
+@dataclass(frozen=True)
+class WhitenessSettings:
+    """family : probability of at least one false alarm in a validation [1], small enough to take an alarm seriously.
+    line_lags : maximum lag over frequency [lines]; leakage and transients correlate neighbouring lines.
+    time_lags : maximum lag over time and with an input [steps of 1/B].
+    negative_lags : maximum lag before an input [steps of 1/B], for an error of the delay; nothing else precedes its
+        cause.
+    silent : power relative to the strongest input, below which an input counts as silent [1]: round-off.
+    """
+
+    family: float = 0.01
+    line_lags: int = 20
+    time_lags: int = 100
+    negative_lags: int = 10
+    silent: float = 1e-12
+
+
+SETTINGS = WhitenessSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +113,15 @@ def whiteness(
     families : number of blocks that are tested, among which the false-alarm probability is divided.
     """
     omega, n = error.block.omega, len(error.block.omega)
-    lines, steps = min(LINE_LAGS, n // 4), min(TIME_LAGS, n // 4)
+    lines, steps = min(SETTINGS.line_lags, n // 4), min(SETTINGS.time_lags, n // 4)
     if lines < 1 or omega[-1] <= omega[0]:
         return None
     power = np.sum(np.abs(error.block.U) ** 2, axis=(0, 2))
-    driven = np.flatnonzero(power > SILENT * power.max()) if power.max() > 0 else np.empty(0, int)
-    lags = np.arange(-min(NEGATIVE_LAGS, steps), steps + 1)
+    driven = np.flatnonzero(power > SETTINGS.silent * power.max()) if power.max() > 0 else np.empty(0, int)
+    lags = np.arange(-min(SETTINGS.negative_lags, steps), steps + 1)
     n_y = len(outputs)
     tests = n_y * (lines + steps + len(driven) * len(lags))
-    level = -np.log(-np.expm1(np.log1p(-FAMILY / families) / tests))
+    level = -np.log(-np.expm1(np.log1p(-SETTINGS.family / families) / tests))
     step = 2 * np.pi / (omega[-1] - omega[0])
     found = [
         _over_frequency(error, outputs, lines, level),

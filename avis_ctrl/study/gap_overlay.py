@@ -16,9 +16,11 @@ from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import clock_of
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.campaign_fit import SAME_LEVEL, driven_inputs, excited_band
-from avis_ctrl.identification.model_error import HALF_WIDTHS
-from avis_ctrl.identification.overlays import POINTS, MeasuredOverlay, thinned
+from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
+from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
+from avis_ctrl.identification.model_error import SETTINGS as MODEL_ERROR
+from avis_ctrl.identification.overlays import SETTINGS as OVERLAY
+from avis_ctrl.identification.overlays import MeasuredOverlay, thinned
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation
@@ -71,7 +73,7 @@ def selections(campaign: Campaign) -> list[Campaign]:
         return []
 
     def alike(top: RecordHeader) -> list[RecordHeader]:
-        low, high = top.level_V / SAME_LEVEL, top.level_V
+        low, high = top.level_V / FIT.same_level, top.level_V
         return [h for h in driven if low <= h.level_V <= high and h.excitation == top.excitation]
 
     most = max(map(alike, driven), key=len)
@@ -156,7 +158,7 @@ def _regressed_on_grid(beside: Campaign) -> FrequencyResponse:
     low, high = np.ceil(band_Hz[0] / step - 1e-9) * step, np.floor(band_Hz[1] / step + 1e-9) * step
     if not 0 < low < high:
         raise InputError("expected a band with lines of every record", field="band_Hz", value=band_Hz)
-    grid = np.clip(np.geomspace(low, high, min(POINTS, round((high - low) / step) + 1)), low, high)
+    grid = np.clip(np.geomspace(low, high, min(OVERLAY.points, round((high - low) / step) + 1)), low, high)
     found = _regressed(beside, band_Hz, grid)
     return replace(found, method=f"{BESIDE}{found.method}")
 
@@ -182,9 +184,9 @@ def _less(records: Campaign, others: Campaign) -> Campaign:
 
 def _regressed(left: Campaign, band_Hz: tuple[float, float], grid: np.ndarray) -> FrequencyResponse:
     """Local polynomial regression. The windows grow until the inputs can be separated in each of them."""
-    for half_width in HALF_WIDTHS[:-1]:
+    for half_width in MODEL_ERROR.half_widths[:-1]:
         try:
             return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=half_width)
         except ComputationError:
             continue
-    return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=HALF_WIDTHS[-1])
+    return local_polynomial(left, band_Hz=band_Hz, frequency_Hz=grid, half_width=MODEL_ERROR.half_widths[-1])

@@ -24,7 +24,8 @@ import numpy as np
 from scipy.stats import norm
 
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.identification.directions import NEGLIGIBLE, KeptMatrices, kept_matrices, matrix_slopes, relative_changes
+from avis_ctrl.identification.directions import SETTINGS as DIRECTIONS
+from avis_ctrl.identification.directions import KeptMatrices, kept_matrices, matrix_slopes, relative_changes
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.plant import Wiring, neglected_dynamics
@@ -46,7 +47,7 @@ class FitUncertaintySettings:
     """
 
     left_out: float = 0.1
-    without_dynamics: float = NEGLIGIBLE
+    without_dynamics: float = DIRECTIONS.negligible
     band_Hz: tuple[float, float] = (0.1, 100.0)
     points: int = 200
     rcond: float = 0.02

@@ -13,7 +13,8 @@ from avis_ctrl.identification import campaign_fit
 from avis_ctrl.identification.maximum_likelihood import SETTINGS, fit, whitened_real
 from avis_ctrl.identification.noise import noise_from_residuals, relative_noise
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spectra import DEPENDENT, record_block, response_block, span
+from avis_ctrl.identification.spectra import SETTINGS as SPECTRA
+from avis_ctrl.identification.spectra import record_block, response_block, span
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -326,7 +327,7 @@ def test_span_of_columns_however_close(apart, rng):
     columns /= np.linalg.norm(columns, axis=0)
     Q, X = span(columns)
     U, s, _ = np.linalg.svd(columns, full_matrices=False)
-    rank = 6 if apart < DEPENDENT else 7
+    rank = 6 if apart < SPECTRA.dependent else 7
     assert Q.shape == (400, rank)
     np.testing.assert_allclose(Q.T @ Q, np.eye(rank), atol=1e-13)
     np.testing.assert_allclose(Q @ Q.T, U[:, :rank] @ U[:, :rank].T, atol=1e-15 * s[0] / s[rank - 1] + 1e-14)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.spread import CONFIDENCES, FrfSpread
+from avis_ctrl.identification.spread import SETTINGS, FrfSpread
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.simulation.discrete import linear_part
@@ -65,7 +65,7 @@ def spread(keep=("z", "phi_x")) -> FrfSpread:
     measured = (
         2e-3 * (1 + 10 / (1 + 30 * np.log(f / 2.2) ** 2)) * np.exp(0.2 * np.random.default_rng(1).standard_normal(200))
     )
-    return FrfSpread(keep, f, measured, np.outer([1.0, 1.2, 1.4, 1.8], measured), CONFIDENCES)
+    return FrfSpread(keep, f, measured, np.outer([1.0, 1.2, 1.4, 1.8], measured), SETTINGS.confidences)
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, c
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.single_axis.identify import distinct, responses_of
-from avis_ctrl.identification.single_axis.seismometer import LARGEST_MODE_DAMPING, Responses, fit_seismometer, response
+from avis_ctrl.identification.single_axis.seismometer import Responses, fit_seismometer, response
 from avis_ctrl.identification.single_axis.sine import SineRecord
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
@@ -187,9 +187,8 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
         return {"frequency_Hz": (w / (2 * np.pi), "Hz"), "damping": (p[0] * w / 2, "1")}
 
     def heavy(p: np.ndarray) -> str:
-        # A mode of damping ratio 0.87 has the phase of a delay to fourth order; a real mount does not.
         damping = mode(p)["damping"][0]
-        return f"a mount with a damping of {damping:.2g} is none" if damping > LARGEST_MODE_DAMPING else ""
+        return f"a mount with a damping of {damping:.2g} is none" if damping > SETTINGS.mode_damping else ""
 
     for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
         what = f"of the {place}"

@@ -43,6 +43,8 @@ class AxisSettings(GapSettings):
     frequencies : minimum number of frequencies of a stepped sine for a search.
     table : number of positions, and of speeds, in the table of forces that a simulation interpolates: odd, so that rest
         is in the middle; 1 % of the largest displacement apart.
+    mode_damping : largest damping ratio of a mode of a sensor's mount [1]; one with 0.87 has the phase of a delay to
+        fourth order, a real mount has less.
     least_angle : travel from which a position may be an angle with a nonlinear sine [rad].
     """
 
@@ -68,6 +70,7 @@ class AxisSettings(GapSettings):
     widened_p_value: float = 0.05
     frequencies: int = 8
     table: int = 801
+    mode_damping: float = 0.2
     least_angle: float = 1.0
 
 

@@ -12,6 +12,8 @@ variance sigma^2 the best linear spring is k + 3 k3 sigma^2 (equivalent linearis
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import least_squares
@@ -19,10 +21,24 @@ from scipy.optimize import least_squares
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
-TRANSIENT = 4  # coefficients of T
-SMOOTHED = 8  # lines on either side whose residual gives the noise
-CORRELATED_LINES = 4
 PARAMETERS = {"m": "u s^2 a unit of y", "d": "u s a unit of y", "k": "u a unit of y"}
+
+
+@dataclass(frozen=True)
+class OscillatorSettings:
+    """transient : coefficients of T: two for the state at both ends of the stretch, two for leakage.
+    smoothed : lines on either side whose residual gives the noise; 17 lines give its level to a quarter, and its colour
+        is as smooth as that.
+    correlated_lines : neighbouring lines whose residuals count as correlated, because leakage spreads over several
+        lines; few compared with the lines of a band.
+    """
+
+    transient: int = 4
+    smoothed: int = 8
+    correlated_lines: int = 4
+
+
+SETTINGS = OscillatorSettings()
 
 
 def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz: tuple[float, float]) -> SingleAxisFit:
@@ -40,7 +56,7 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
     U, Y, f = _lines(u, y, sample_rate_Hz, band_Hz)
     s = 2j * np.pi * f
     s0 = 2 * np.pi * float(np.sqrt(band_Hz[0] * band_Hz[1])) if band_Hz[0] > 0 else np.pi * band_Hz[1]
-    powers = (s / s0)[:, None] ** np.arange(TRANSIENT)
+    powers = (s / s0)[:, None] ** np.arange(SETTINGS.transient)
 
     def oscillator(x: np.ndarray) -> np.ndarray:
         return x[0] * (s / s0) ** 2 + x[1] * s / s0 + x[2]
@@ -59,7 +75,7 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         e = left(x, weight)
         error = (e[: len(f)] + 1j * e[len(f) :]) / weight
         power = np.abs(error) ** 2
-        level = uniform_filter1d(power, 2 * SMOOTHED + 1, mode="nearest")
+        level = uniform_filter1d(power, 2 * SETTINGS.smoothed + 1, mode="nearest")
         weight = np.sqrt(2 / np.maximum(level, 1e-12 * power.mean() + np.finfo(float).tiny))
     to_units = np.array([1 / s0**2, 1 / s0, 1.0])
     if not (x[0] > 0 and x[2] > 0):
@@ -70,7 +86,7 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
             next_step="check the columns and widen the band",
         )
     J = slopes(lambda x: left(x, weight), x, np.abs(x)) / to_units
-    n, e, spent = len(f), left(x, weight), len(x) + TRANSIENT
+    n, e, spent = len(f), left(x, weight), len(x) + SETTINGS.transient
     # The damping is determined by the few lines of the resonance, to which the fit adapts.
     return concluded(
         "m y'' + d y' + k y = u",
@@ -80,8 +96,8 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         J.reshape(2, n, -1).swapaxes(0, 1),
         spent,
         (f, Y, Y - error),
-        lags=CORRELATED_LINES,
-        method=f"noise from the residual's spectrum, neighbouring {CORRELATED_LINES} lines correlated",
+        lags=SETTINGS.correlated_lines,
+        method=f"noise from the residual's spectrum, neighbouring {SETTINGS.correlated_lines} lines correlated",
         notes=(
             "of the best linear oscillator at the level of this record; another level has another, "
             "which the deviations do not hold",

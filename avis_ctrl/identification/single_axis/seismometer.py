@@ -20,10 +20,6 @@ from scipy.optimize import brentq, least_squares
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded, slopes
 
-# Misfits of neighbouring frequencies are similar; scores count as correlated over this many frequencies.
-CORRELATED_LINES = 2
-# A mount mode with more damping has the phase of a delay to fourth order, so that the two cannot be distinguished.
-LARGEST_MODE_DAMPING = 0.2
 POWER = {"coil": 1, "displacement": 0, "ground": 2}
 UNITS = {
     "corner_Hz": "Hz",
@@ -34,6 +30,17 @@ UNITS = {
     "drive_delay_s": "s",
     "delay_s": "s",
 }
+
+
+@dataclass(frozen=True)
+class SeismometerSettings:
+    """correlated_lines : frequencies over which scores count as correlated, because misfits of neighbours are
+    similar; a stepped sine has too few frequencies for more."""
+
+    correlated_lines: int = 2
+
+
+SETTINGS = SeismometerSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +146,10 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
         slopes(lambda x: misses(x, r), theta, scale),
         len(names),
         (data.frequency_Hz, measured, predicted),
-        lags=CORRELATED_LINES,
+        lags=SETTINGS.correlated_lines,
         relative=(measured - predicted) / np.abs(measured),
         method=f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated "
-        f"(Newey-West, {min(CORRELATED_LINES, len(e) // 4)} lags)",
+        f"(Newey-West, {min(SETTINGS.correlated_lines, len(e) // 4)} lags)",
         given_chi2=float(np.sum(misses(theta, 0.0) ** 2)),
         notes=(f"columns of the figure data: {', '.join(kinds)}",),
     )

@@ -9,10 +9,21 @@ from scipy.optimize import minimize_scalar
 
 from avis_ctrl.errors import ComputationError, InputError
 
-HARMONICS = 7  # fitted, so that distortion does not count as noise
-NEIGHBOURS = 12  # lines on either side whose residual gives the noise
-# Largest r.m.s. of the unexplained part over that of the sine; above it a channel is not a measurement of a sine.
-LARGEST_SHARE = 0.2
+
+@dataclass(frozen=True)
+class SineSettings:
+    """harmonics : fitted, the fundamental included, so that distortion does not count as noise; higher ones are weak.
+    neighbours : lines on either side whose residual gives the noise; two dozen lines give its power to a fifth.
+    largest_share : r.m.s. of the unexplained part over that of the sine, above which a channel is not a measurement of
+        a sine [1].
+    """
+
+    harmonics: int = 7
+    neighbours: int = 12
+    largest_share: float = 0.2
+
+
+SETTINGS = SineSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +56,7 @@ class SineRecord:
     def refusal(self, channel: str) -> str:
         """Why this channel is not a sine; empty if it is one."""
         i = self._index(channel)
-        if self.unexplained[i] <= LARGEST_SHARE:
+        if self.unexplained[i] <= SETTINGS.largest_share:
             return ""
         # A sine stays within 0.1 % of its range from one end for 2 % of its period.
         stuck = (
@@ -79,7 +90,7 @@ def fit_sine(name: str, time: np.ndarray, channels: dict[str, np.ndarray], refer
     period = float(time[-1] - time[0]) / (n - 1)
     t = np.arange(n) * period
     frequency = _frequency(name, t, y[:, list(channels).index(reference)])
-    count = max(1, min(HARMONICS, int(0.45 / period / frequency)))
+    count = max(1, min(SETTINGS.harmonics, int(0.45 / period / frequency)))
     X = _columns(t, frequency, count)
     b = np.linalg.lstsq(X, y, rcond=None)[0]
     phasors = b[0 : 2 * count : 2] - 1j * b[1 : 2 * count : 2]
@@ -139,7 +150,7 @@ def _line_noise(e: np.ndarray, cycles_per_sample: float) -> np.ndarray:
     lines = np.array(
         [
             k
-            for k in range(max(1, centre - NEIGHBOURS), min(n // 2, centre + NEIGHBOURS + 1))
+            for k in range(max(1, centre - SETTINGS.neighbours), min(n // 2, centre + SETTINGS.neighbours + 1))
             if abs(k - cycles_per_sample * n) > 1
         ]
     )
