@@ -11,7 +11,8 @@ from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, markers
 from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 from avis_ctrl.study.design_result import DesignResult
-from avis_ctrl.study.identified_uncertainty import SETTINGS, InDesign
+from avis_ctrl.study.identified_uncertainty import SETTINGS as COMPARED
+from avis_ctrl.study.identified_uncertainty import InDesign
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str
 def spread(found: InDesign) -> Figure:
     """The measured spread of the response, its bound, and the filter that covers it."""
     s, weight = found.spread, found.weight
-    low, high = SETTINGS.band_Hz
+    low, high = COMPARED.band_Hz
     f = np.geomspace(min(low, s.frequency_Hz[0]), max(high, s.frequency_Hz[-1]), 400)
     omega = 2 * np.pi * f
     noise, covering = 100 * (s.bound(found.confidence) - s.measured), 100 * weight.shape.magnitude(omega)
