@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import combinations
 from operator import itemgetter
 
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter, Table, Values, register
-from avis_ctrl.gap.effects.impedance import recoils
+from avis_ctrl.gap.effects.impedance import DIAGONAL, recoil_of, recoils
 from avis_ctrl.gap.effects.mounts import OfMounts
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.operators import Operators
@@ -21,9 +22,10 @@ from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.rigs.rigid_body import point_map
 
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
-# Coordinates whose frequencies are searched together: the low centre of mass of a frame couples x and ry, and y and rx,
-# so that one can compensate for the other.
+# Coordinates whose frequencies are searched together: the low centre of mass of a frame couples x and ry, and y and rx.
 TOGETHER = (("x", "ry"), ("y", "rx"), *((coordinate,) for coordinate in COORDINATES))
+# Entries of the inverse mass matrix that these have.
+ENTRIES = (*DIAGONAL, *(tuple(map(COORDINATES.index, group)) for group in TOGETHER[:2]))
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class ChassisSettings:
     heights_m : height of the mass over the table's centre, and of the springs over the mass [m], at which a fit starts.
     lines : lines of a record for the search around a fit: fewer than the fit's, because only the order of the groups of
         coordinates matters.
+    narrowest : minimum damping ratio of the resonances searched around a fit [1]; a smaller one would need more
+        frequencies, which are twice the half width apart.
     followed_groups : number of groups of coordinates whose new frequencies are fitted, the most promising first.
     """
 
@@ -55,7 +59,8 @@ class ChassisSettings:
     mass_ratio: float = 3.0
     radius_m: tuple[float, float] = (0.1, 3.0)
     heights_m: tuple[float, float] = (-0.3, 0.0)
-    lines: int = 100
+    lines: int = 200
+    narrowest: float = 0.02
     followed_groups: int = 2
 
 
@@ -164,35 +169,31 @@ class BaseCompliance(OfMounts):
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """The same law with other frequencies of one coordinate, or of two coupled ones. A fit can end with a wrong
-        frequency, for which the other parameters compensate. Therefore the chassis is first fixed in these coordinates,
-        and the score test then gives the frequencies that reduce the sum of squares most."""
+        frequency, for which the other parameters compensate.
+
+        To first order, the recoil in these coordinates is replaced by that of other resonances. The suspension modes,
+        which are sharp, stay where they are, since the data fix the compliance of the base.
+        """
         blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
-        rest, place = score.model.without(one.label), one.place
-        here, found = Score(rest.with_effect(one), blocks).chi2, []
+        model = score.model.without(one.label).with_effect(one)
+        around, place = Score(replace(model, held=model.held | {one.label}), blocks), one.place
+        damping = max(one.by_name["damping"], SETTINGS.narrowest)
+        low, high, _ = SETTINGS.own_Hz
+        grid = np.geomspace(low, high, int(np.log(high / low) / (2 * damping)) + 2)
+        A = np.array([recoils(around, partial(receptance, frequency_Hz=f, damping=damping), ENTRIES) for f in grid])
+        found = []
         for group in TOGETHER:
-            if not set(group) <= set(_coordinates(place)):
-                continue
-            fixed = _with_frequencies(one, dict.fromkeys(group, SETTINGS.fixed_Hz))
-            without = Score(rest.with_effect(fixed), blocks)
-            best, took = _resonances(without, group)
-            inverse = dict(zip(best, took.coefficients, strict=True))
-            radii = {turn: _radius(one.by_name["mass_kg"], inverse[turn]) for turn in best if len(turn) > 1}
-            found.append((without.chi2 - took.chi2, _with_frequencies(fixed, best, radii).values))
-        return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < here]
+            if set(group) <= set(_coordinates(place)):
+                fixed = _with_frequencies(one, dict.fromkeys(group, SETTINGS.fixed_Hz))
+                now = recoil_of(around, partial(_difference, one.by_name, fixed.by_name))
+                rest = around.e + now
+                columns = [ENTRIES.index(entry) for entry in _entries(group)]
+                for chi2, values in _other_resonances(A[:, columns], rest, group, grid, one):
+                    found.append((chi2, _within(one, values)))
+        return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < around.chi2]
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        mass, damping, stiffness = of_chassis(values)
-        s = ops.s[:, None, None]
-        tied = stiffness + s * damping
-        if "rx_Hz" in values:
-            B = np.linalg.inv(s**2 * mass + tied)
-            H = B @ tied[:, :, :3]
-        else:
-            B, H, along = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex), range(3)
-            held = tied[:, along, along]
-            D = s[:, :, 0] ** 2 * mass[along, along] + held
-            B[:, along, along], H[:, along, along] = 1 / D, held / D
-        ops.recoil, ops.follow = B, H
+        ops.recoil, ops.follow = _recoil(values, ops.s)
 
 
 def _coordinates(place: str) -> tuple[str, ...]:
@@ -214,6 +215,93 @@ def of_chassis(values: Values) -> np.ndarray:
         which += place.T @ np.diag(one[:3]) @ place
         which[3:, 3:] += np.diag(one[3:])
     return found
+
+
+def _recoil(values: Values, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """B (n, 6, 6), displacement of the chassis per force on it, and H (n, 6, 3), per displacement of the floor."""
+    mass, damping, stiffness = of_chassis(values)
+    s = s[:, None, None]
+    tied = stiffness + s * damping
+    if "rx_Hz" in values:
+        B = np.linalg.inv(s**2 * mass + tied)
+        return B, B @ tied[:, :, :3]
+    B, H, along = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex), range(3)
+    held = tied[:, along, along]
+    D = s[:, :, 0] ** 2 * mass[along, along] + held
+    B[:, along, along], H[:, along, along] = 1 / D, held / D
+    return B, H
+
+
+def _difference(one: Values, other: Values, s: np.ndarray) -> np.ndarray:
+    """(n, 6, 6): recoil of one chassis beyond that of another."""
+    return _recoil(one, s)[0] - _recoil(other, s)[0]
+
+
+def _entries(group: Sequence[str]) -> list[tuple[int, ...]]:
+    """Entries of the inverse mass matrix that coordinates have."""
+    own = tuple(map(COORDINATES.index, group))
+    return [*((k, k) for k in own), *([own] if len(own) > 1 else [])]
+
+
+def _other_resonances(
+    A: np.ndarray, rest: np.ndarray, group: Sequence[str], grid: np.ndarray, one: ActiveEffect
+) -> list[tuple[float, dict[str, float]]]:
+    """Sum of squares and new values of a chassis for the best resonances on the grid (n,) [Hz]: one of a single
+    coordinate; for two, also a pair of modes in which they are coupled.
+
+    A : (n, entries, N) directions. rest : (N,) residual without recoil in these coordinates.
+    """
+    n, entries, _ = A.shape
+    rows = A.reshape(n * entries, -1)
+    gram, product, whole = rows @ rows.T, rows @ rest, float(rest @ rest)
+    best: tuple[float, dict[str, float]] | None = None
+    for at in combinations(range(n), len(group)):
+        own = [entries * k + j for k in at for j in range(entries)]
+        took = reduction(gram[np.ix_(own, own)], product[own])
+        if best is None or whole - took.chi2 < best[0]:
+            values = _body_of(group, took.coefficients.reshape(len(at), entries), grid[list(at)], one.by_name)
+            best = (whole - took.chi2, values) if values else best
+    return [best] if best else []
+
+
+def _body_of(group: Sequence[str], entries: np.ndarray, f: np.ndarray, now: Values) -> dict[str, float]:
+    """Values of a chassis with the residues of modes at f [Hz] in one coordinate (1, 1), or in a translation and a
+    rotation that are coupled (2, 3); empty if no body of about the same mass has them.
+
+    The sum of the residue matrices is the inverse mass matrix, the sum of each over w^2 the compliance of the base.
+    From these follow mass, radius of gyration, both heights and both frequencies.
+    """
+    turn = f"gyration_{group[-1][-1]}_m"
+    if len(group) == 1:
+        if entries[0, 0] <= 0:
+            return {}
+        own = {turn: _radius(now["mass_kg"], entries[0, 0])} if len(group[0]) > 1 else {}
+        return {f"{group[0]}_Hz": float(f[0])} | own
+    residues, w = entries[:, [[0, 2], [2, 1]]], 2 * np.pi * f[:, None, None]
+    inverse, compliance = residues.sum(axis=0), (residues / w**2).sum(axis=0)
+    if min(np.linalg.eigvalsh(inverse)[0], np.linalg.eigvalsh(compliance)[0]) <= 0:
+        return {}
+    M, K = np.linalg.inv(inverse), np.linalg.inv(compliance)
+    # A force along x at the height z turns about y with z, one along y about x with -z.
+    sign = 1.0 if group[0] == "x" else -1.0
+    mass, centre, springs = M[0, 0], sign * M[0, 1] / M[0, 0], sign * K[0, 1] / K[0, 0]
+    if not 1 / SETTINGS.mass_ratio < mass / now["mass_kg"] < SETTINGS.mass_ratio:
+        return {}
+    inertia, rotation = M[1, 1] - mass * centre**2, K[1, 1] - K[0, 0] * springs**2
+    return {
+        "mass_kg": mass,
+        f"{group[0]}_Hz": np.sqrt(K[0, 0] / mass) / (2 * np.pi),
+        f"{group[1]}_Hz": np.sqrt(rotation / inertia) / (2 * np.pi),
+        turn: np.sqrt(inertia / mass),
+        "centre_z_m": centre,
+        "base_z_m": springs - centre,
+    }
+
+
+def _within(one: ActiveEffect, values: Values) -> tuple[float, ...]:
+    """The values of a chassis with some of them replaced, within their ranges."""
+    found = {**one.by_name, **values}
+    return tuple(float(np.clip(found[p.name], p.low, p.high)) for p in one.parameters)
 
 
 def _radius(mass: float, inverse_inertia: float) -> float:

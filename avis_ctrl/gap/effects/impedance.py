@@ -13,9 +13,12 @@ from functools import lru_cache
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
-from avis_ctrl.gap.score import Score, symmetric_coordinates
+from avis_ctrl.gap.score import Part, Score, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS
 from avis_ctrl.rigs.rigid_body import point_map
+
+# Entries of a symmetric matrix of the six coordinates.
+DIAGONAL = tuple((k, k) for k in range(6))
 
 
 def place_grid() -> tuple[np.ndarray, ...]:
@@ -107,16 +110,36 @@ def peaks(score: Score) -> tuple[float, ...]:
     return score.kept["peaks"]
 
 
-def recoils(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """(6, N): directions of each recoil coordinate of a chassis; receptance of s (n,) is that of unit mass."""
+def recoils(
+    score: Score, receptance: Callable[[np.ndarray], np.ndarray], entries: Sequence[tuple[int, ...]] = DIAGONAL
+) -> np.ndarray:
+    """(len(entries), N): directions of entries of a chassis' inverse mass matrix, which is symmetric; receptance of s
+    (n,) is that of unit mass."""
+    i, j = np.array(entries).T
+    off = (i != j)[:, None, None, None]
     columns = []
     for part in score.parts:
-        made, response = part.made, part.response
-        through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-        amount = part.s**2 * (made.M @ response.x[:, :6]) * receptance(part.s[:, 0, 0])[:, None, None]
-        measured = response.left[:, :, :6] @ through
-        columns.append(-np.moveaxis(measured[:, :, :, None] * amount[:, None], 2, 0))
+        moved, force = _through_chassis(part)
+        out, force = np.moveaxis(moved, 2, 0)[..., None], np.moveaxis(force, 1, 0)[:, :, None]
+        both = out[i] * force[j] + off * out[j] * force[i]
+        columns.append(both * receptance(part.s[:, 0, 0])[:, None, None])
     return score.directions(columns)
+
+
+def recoil_of(score: Score, recoil: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """(N,): direction of a recoil (n, 6, 6), displacement of the chassis per force on it, of s (n,)."""
+    columns = []
+    for part in score.parts:
+        moved, force = _through_chassis(part)
+        columns.append((moved @ recoil(part.s[:, 0, 0]) @ force)[None])
+    return score.directions(columns)[0]
+
+
+def _through_chassis(part: Part) -> tuple[np.ndarray, np.ndarray]:
+    """(n, n_y, 6) y per displacement of the chassis, and (n, 6, m) the force of the payload on it."""
+    made, response = part.made, part.response
+    through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
+    return response.left[:, :, :6] @ through, -(part.s**2) * (made.M @ response.x[:, :6])
 
 
 def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
