@@ -167,6 +167,18 @@ def test_a_light_chassis_is_found_although_tolerances_imitate_it_at_first():
     assert told["z_Hz"].value == pytest.approx(true["frequency_Hz"], rel=0.002)
 
 
+def test_coupled_resonances_are_found_beside_a_fit_with_other_ones():
+    """Modes in which a translation and a rotation mix; the fit took one for stiff and the other at a wrong frequency."""
+    true = [1400.0, 0.02, 18.1, 16.3, 18.6, 19.2, 17.2, 20.7, 0.5, 0.5, 0.45, -0.43, -0.1]
+    wrong = [1600.0, 0.02, 75.0, 16.3, 18.6, 19.2, 19.5, 20.7, 0.5, 0.5, 0.45, -0.36, -0.07]
+    place = "chassis/rocking"
+    blocks = recorded(with_effect("base_compliance", place, true), 2, 1e-4)
+    fit = with_effect("base_compliance", place, wrong)
+    found = fit.effects[0].effect.extended_models(Score(fit, blocks), fit.effects[0])
+    frequencies = np.array([values[2:8] for _, values in found])
+    assert np.min(np.max(np.abs(frequencies / true[2:8] - 1), axis=1)) < 0.08
+
+
 @pytest.mark.slow
 def test_six_sharp_resonances_of_a_chassis_are_found():
     """A chassis of 1.5 % damping that moves in all six coordinates from 10 to 22 Hz, each at its own frequency."""
@@ -177,3 +189,20 @@ def test_six_sharp_resonances_of_a_chassis_are_found():
     names = [f"{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
     np.testing.assert_allclose([told[name].value for name in names], true.details["frequencies_Hz"], rtol=0.01)
     assert told["mass_kg"].value == pytest.approx(true.parameters["mass_kg"], rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "options"), [(71901, {}), (71604, {"kind": "one", "effect": "base_compliance"})])
+def test_coupled_sharp_resonances_of_a_chassis_are_found(seed, options):
+    """Modes of 2 % damping in which x and the rotation about y are mixed: a fit that takes x for stiff leaves a third
+    of the gap, or names a sprung mass beside the chassis."""
+    case = draw_case(seed, duration_s=60.0, **options)
+    (true,) = case.effects
+    found = analyse(
+        simulate_case(case), rig(), effects=[library()["base_compliance"], library()["attached_oscillator"]]
+    )
+    assert [one.name for one in found.effects] == [true.name] == ["base_compliance"]
+    told = found.effects[0].parameters
+    names = [f"{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
+    np.testing.assert_allclose([told[name].value for name in names], true.details["frequencies_Hz"], rtol=0.005)
+    assert told["mass_kg"].value == pytest.approx(true.parameters["mass_kg"], rel=0.01)
