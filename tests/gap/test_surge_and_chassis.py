@@ -168,7 +168,7 @@ def test_a_light_chassis_is_found_although_tolerances_imitate_it_at_first():
 
 
 def test_coupled_resonances_are_found_beside_a_fit_with_other_ones():
-    """Modes in which a translation and a rotation mix; the fit took one for stiff and the other at a wrong frequency."""
+    """Modes in which a translation and a rotation mix; the fit took one for stiff, the other at a wrong frequency."""
     true = [1400.0, 0.02, 18.1, 16.3, 18.6, 19.2, 17.2, 20.7, 0.5, 0.5, 0.45, -0.43, -0.1]
     wrong = [1600.0, 0.02, 75.0, 16.3, 18.6, 19.2, 19.5, 20.7, 0.5, 0.5, 0.45, -0.36, -0.07]
     place = "chassis/rocking"
