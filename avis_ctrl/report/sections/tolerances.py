@@ -13,29 +13,33 @@ from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
 
 
 @dataclass(frozen=True)
-class Shown:
-    """rows : maximum number of table rows. far : change, in tolerances, beyond which a value counts as far off."""
+class ToleranceSettings:
+    """rows : maximum number of rows, which fill a third of a page; the JSON file has all. far : change in tolerances
+    beyond which a value counts as far off [1]: one in 400 if the tolerances are right."""
 
     rows: int = 10
     far: float = 3.0
 
 
-def tolerances(found: Sequence[Tolerance], shown: Shown = Shown()) -> list[Piece]:
+SETTINGS = ToleranceSettings()
+
+
+def tolerances(found: Sequence[Tolerance]) -> list[Piece]:
     """Changes of the values: a summary of all, and a table of the largest."""
     if not found:
         return []
     moved = np.array([one.moved for one in found])
-    far = int(np.sum(np.abs(moved) > shown.far))
+    far = int(np.sum(np.abs(moved) > SETTINGS.far))
     rms = words.number(float(np.sqrt(np.mean(moved**2))), 2)
     rows = [
         (one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
-        for one in found[: shown.rows]
+        for one in found[: SETTINGS.rows]
     ]
     return [
         Heading("Tolerances"),
         Paragraph(
             f"{len(found)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
-            f"(r.m.s.), {far or 'none'} of them by more than {shown.far:g} tolerances."
+            f"(r.m.s.), {far or 'none'} of them by more than {SETTINGS.far:g} tolerances."
         ),
         table(
             f"The {len(rows)} values of the rig file that moved most, in units of their tolerance. The JSON file of "
