@@ -310,6 +310,7 @@ def test_hostile_input_is_one_line(case, gates):
     assert said in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_band_without_excitation():
     """There noise agrees with any model. It is refused before anything is computed."""
     case, steps = draw_case(duration_s=6.0, seed=3, kind="none"), []

@@ -26,6 +26,8 @@ NO_TUNING = {
     "COORDINATES",
     "COUNTS",
     "DECAY",
+    "DIAGONAL",
+    "ENTRIES",
     "FASTER",
     "FILES",
     "FORMAT",
