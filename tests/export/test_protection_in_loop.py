@@ -64,6 +64,7 @@ def overload(loop, code, seconds: float = 30.0):
     return simulate(wide, seconds, 1, settle_s=0.0, floor=floor, code=code)
 
 
+@pytest.mark.slow
 def test_drives_at_their_limits_release_the_table(parts):
     """Limits for seconds; afterwards the table comes to rest, and the voltages were never beyond the limits."""
     controller, guard, loop = parts

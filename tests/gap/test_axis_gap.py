@@ -245,6 +245,7 @@ def friction_gap(data, rate=1000.0, **options):
     return find_axis_gap("drive", records=[Signals("a", data["force"], data["position"])], rate=rate, **options)
 
 
+@pytest.mark.slow
 def test_drive_coulomb_friction():
     gap = friction_gap(drive(coulomb))
     assert names(gap) == ["coulomb_friction"] and gap.verdict == "explained"

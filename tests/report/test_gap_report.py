@@ -412,6 +412,7 @@ def test_next_to_nothing_found(found, verdict, tmp_path):
         assert "No fractions of power were computed" in pdf_text(gap_pdf(poor), tmp_path)
 
 
+@pytest.mark.slow
 def test_numbers_that_are_not_finite(found):
     """A stage without noise, a place without statistics, an effect without deviation: said in words."""
     nan, inf = float("nan"), float("inf")

@@ -195,6 +195,7 @@ def test_text_from_files_is_never_markup(html: bytes, hostile: DesignResult, tmp
     assert '#panic("y") $ *z* {{ 7*7 }}' in text and "<b>x</b>" in text
 
 
+@pytest.mark.slow
 def test_same_input_same_bytes(fabricated: DesignResult, html: bytes, pdf: bytes) -> None:
     assert render_html(fabricated) == html
     assert render_pdf(fabricated) == pdf

@@ -191,6 +191,7 @@ def test_synthesis_improves_on_h_infinity():
     assert mu_peak(lft_lower(P, result.K), full).lower <= result.mu_upper < 0.93 * start
 
 
+@pytest.mark.slow
 def test_real_blocks_are_said_to_be_treated_as_complex_and_both_are_measured():
     P, blocks = table()
     result = musyn(P, blocks, 1, 1, max_iterations=4)

@@ -287,6 +287,7 @@ def _table() -> dict:
     }
 
 
+@pytest.mark.slow
 def test_a_member_of_the_set_is_simulated_as_it_is(folder):
     """Volts to motion of the sampled loop's table against the plant's LFT with the same perturbation."""
     design, rig = read_study(folder / "design.toml")

@@ -268,6 +268,7 @@ def test_one_option_for_where_it_runs(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_helpers_count_processes(tmp_path):
     """The test of the test: the log tells calls and processes apart."""
     write_points(tmp_path, 2)
