@@ -9,7 +9,7 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -79,6 +79,8 @@ class AvisTable(Rig):
         `all_drives` and `sensors` return both kinds, in this order.
     limit_V : voltage limit of all drives without an individual limit.
     """
+
+    gain_per_sensor: ClassVar[bool] = True
 
     name: str
     mass: float

@@ -6,7 +6,7 @@ import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -39,7 +39,11 @@ class Rig(ABC):
 
     The coordinates q are those of the payload's geometric centre; `edge_m` is the lever arm that converts phi_x into
     a displacement of the edge along z.
+
+    gain_per_sensor : whether the rig file has a gain for each sensor, which `with_sensor_gains` changes.
     """
+
+    gain_per_sensor: ClassVar[bool] = False
 
     name: str
     geophones: Geophones | None

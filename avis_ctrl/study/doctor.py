@@ -54,10 +54,10 @@ def _attempt(name: str, check: Callable[[], str]) -> Check:
         return Check(name, f"{type(error).__name__}: {error}".splitlines()[0][:100], False)
 
 
-def _near(value: float, known: float, tolerance: float) -> float:
+def _near(value: float, known: float, tolerance: float) -> str:
     if not abs(value - known) <= tolerance * abs(known):
         raise ArithmeticError(f"{value:.6g} instead of {known:.6g}")
-    return value
+    return f"{value:.6g}"
 
 
 def _threads() -> str:
@@ -73,9 +73,7 @@ def _slicot() -> str:
     from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 
     zeta = 0.1
-    return (
-        f"{_near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta**2)), 1e-6):.6g}"
-    )
+    return _near(hinf_norm_slicot(tf([1.0], [1.0, 2 * zeta, 1.0])), 1 / (2 * zeta * np.sqrt(1 - zeta**2)), 1e-6)
 
 
 def _clarabel() -> str:
@@ -86,7 +84,7 @@ def _clarabel() -> str:
     t = cp.Variable()
     problem: Any = cp.Problem(cp.Minimize(t), [t * np.eye(2) - A >> 0])
     problem.solve(solver=cp.CLARABEL)
-    return f"{_near(float(np.asarray(t.value)), float(np.max(np.linalg.eigvalsh(A))), 1e-6):.6g}"
+    return _near(float(np.asarray(t.value)), float(np.max(np.linalg.eigvalsh(A))), 1e-6)
 
 
 def _mu() -> str:
@@ -99,7 +97,7 @@ def _mu() -> str:
 
     M = np.outer([1.0, 2.0, 3.0], [1.0, -1.0j, 0.5])
     found = [float(mu(M, [ComplexScalar()] * 3).upper), float(mu(np.abs(M), [RealScalar()] * 3).upper)]
-    return f"{_near(max(found, key=lambda one: abs(one - 4.5)), 4.5, 1e-4):.6g}"
+    return _near(max(found, key=lambda one: abs(one - 4.5)), 4.5, 1e-4)
 
 
 def _simulation() -> str:
@@ -117,15 +115,15 @@ def _simulation() -> str:
 
 
 def _prediction() -> str:
-    """Small motion is linear: with the terms of large motion, readings of microvolts remain the same; compiles both."""
+    """Small motion is linear: with the terms of large motion, readings of microvolts are the same; compiles both."""
     from avis_ctrl.identification.predictor import Predictor
     from avis_ctrl.identification.response import ResponseModel
     from avis_ctrl.rigs.rig_file import load_rig
 
     model = ResponseModel.of(load_rig("avis"), ())
     u = 1e-6 * np.random.default_rng(1).standard_normal((200, len(model.actuators)))
-    linear, large = (Predictor(model, large_motion).read(u) for large_motion in (False, True))
-    return f"r.m.s. {1e6 * _near(np.std(large), np.std(linear), 1e-6):.3g} uV"
+    linear, large = (1e6 * np.std(Predictor(model, large_motion).read(u)) for large_motion in (False, True))
+    return f"{_near(large, linear, 1e-6)} uV r.m.s."
 
 
 def _kalman() -> str:
@@ -139,7 +137,7 @@ def _kalman() -> str:
     kalman = ParameterFilter(linear_model(rig, ("mass",)), SOURCE_SETTINGS, np.full(6, 1e-10), 1 / rig.sample_rate_Hz)
     kalman.begin(np.zeros(6))
     kalman.filter(np.zeros((100, 8)), np.zeros((100, 6)), 1)
-    return f"mass {_near(float(kalman.theta[0]), rig.parameters()['mass'].value, 1e-9):.6g} kg"
+    return f"mass {_near(float(kalman.theta[0]), rig.parameters()['mass'].value, 1e-9)} kg"
 
 
 def _gcc() -> str:
@@ -173,4 +171,4 @@ def _synthesis() -> str:
         gain(1e-4, ["u"], ["z_u"]),
     ]
     made = hinfsyn(connect(parts, ["w", "u"], ["z", "z_u", "e"]), 1, 1, backoff=1e-3)
-    return f"{_near(made.gamma, abs(weight(z)[0, 0]), 1e-2):.6g}"
+    return _near(made.gamma, abs(weight(z)[0, 0]), 1e-2)

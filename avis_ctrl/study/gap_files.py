@@ -24,7 +24,6 @@ from avis_ctrl.identification.predictor import model_inputs, predict
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.file_errors import read_json
-from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.file_names import (
@@ -156,7 +155,7 @@ def _in_rig(rig: Rig, one: ActiveEffect) -> Rig | None:
     if one.effect.name == "actuator_gain":
         name = rig.force_constant(one.place)
         return rig.with_parameters({name: rig.parameters()[name].value * values["gain"]})
-    if one.effect.name == "sensor_gain" and not isinstance(rig, Halcyonics):  # one sensitivity for all
+    if one.effect.name == "sensor_gain" and rig.gain_per_sensor:
         gain = next(sensor.gain for sensor in rig.sensors() if sensor.name == one.place)
         return rig.with_sensor_gains({one.place: gain * values["gain"]})
     if one.effect.name == "loop_delay":

@@ -24,7 +24,6 @@ from avis_ctrl.lti.connect import connect, lft_lower
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.realisation import with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, append, gain
-from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.sampled_loop import lever_arms
@@ -213,7 +212,7 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
     for one in model.effects:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
-        fits = name in DESCRIBED_IN and not (name == "sensor_gain" and isinstance(rig, Halcyonics))
+        fits = name in DESCRIBED_IN and (name != "sensor_gain" or rig.gain_per_sensor)
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_gain":
             key = rig.force_constant(one.place)
@@ -237,7 +236,7 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
 
 def _with_sensitivity(rig: Any, model: TableModel, factors: Mapping[str, float]) -> Any:
     """The rig with the sensitivities of the model's sensors, including effects."""
-    if isinstance(rig, Halcyonics) or model.sensors.unit != "V":
+    if not rig.gain_per_sensor or model.sensors.unit != "V":
         return rig
     return rig.with_sensor_gains(
         {

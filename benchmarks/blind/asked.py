@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -13,77 +13,78 @@ from benchmarks.blind.rates import Share
 from benchmarks.blind.tables import Table
 
 SURE = 0.9
-# Row: what is asked of clean and of cluttered tables.
-ASKED = {
-    "no effect: false names": ("at most 2 %", "at most 5 %"),
-    "one effect, clear or gross: named first": ("97 %", "90 %"),
-    "right place, where the effect has one and its name is right": ("97 %", "90 %"),
-    "two effects: both named": ("85 %", "70 %"),
-    "outside the library: named as something else": ("at most 5 %", "at most 10 %"),
-    "parameter inside its own 95 % interval": ("90 to 98 %", "88 to 98 %"),
-    f"probability above {SURE:g} claimed, and right": ("97 %", "90 %"),
-    "unseen record: updated within 0.1 (cluttered 0.33) of re-identified or 1.2 (1.5) of best possible": (
-        "each",
-        "each",
-    ),
-}
 
 
 def asked_table(cases: Sequence[Judged]) -> Table:
     """Two columns for clean tables and two for cluttered ones, where there are any; a crash is never a good answer."""
-    groups = [[case for case in cases if case.line.cluttered == cluttered] for cluttered in (False, True)]
-    words = [("clean", "asked"), ("cluttered", "asked")]
-    found = [figures(group) for group in groups if group]
-    present = [k for k, group in enumerate(groups) if group]
-    rows: list[tuple[str, ...]] = []
-    for name in found[0] if found else ():
-        limits = ASKED.get(name, ("", ""))
-        rows.append((name, *sum(((one[name], limits[k]) for k, one in zip(present, found, strict=True)), ())))
+    head, columns = [""], []
+    for k, word in enumerate(("clean", "cluttered")):
+        if group := [case for case in cases if case.line.cluttered == bool(k)]:
+            head += [word, "asked"]
+            columns.append({name: (figure, asked[k] if asked else "") for name, figure, *asked in figures(group)})
     return Table(
         "Asked and measured",
-        ("", *sum((words[k] for k in present), ())),
-        tuple(rows),
+        tuple(head),
+        tuple((name, *(cell for one in columns for cell in one[name])) for name in (columns[0] if columns else ())),
         "Fractions with Wilson's 95 % interval. Traces of a cluttered table (hum, friction, stiffening, loss) are "
         "there, so their names are not false; nor is what the answer lists under its own traces. Best possible: the "
         "true table with its traces and all that is random switched off, against the same measured records.",
     )
 
 
-def figures(cases: Sequence[Judged]) -> dict[str, str]:
+def figures(cases: Sequence[Judged]) -> list[tuple[str, ...]]:
+    """Name and figure of each row; where something is asked, also what of clean and of cluttered tables."""
     one, two = ([case for case in of_kind(cases, kind)] for kind in ("one", "two"))
-    return {
-        "cases": str(len(cases)),
-        "no effect: false names": str(Share.of([_fails(case) for case in of_kind(cases, "none")])),
-        "one effect, clear or gross: named first": str(
-            Share.of([named_first(case) for case in one if case.line.clear])
+
+    def fraction(hits: Iterable[bool]) -> str:
+        return str(Share.of(list(hits)))
+
+    closed = (closes_the_gap(case) for case in cases if case.line.kind != "outside" and case.line.unseen)
+    sure = (case.right(named, exact=False) for case in cases for named in case.named if named.probability > SURE)
+    return [
+        ("cases", str(len(cases))),
+        ("no effect: false names", fraction(map(_fails, of_kind(cases, "none"))), "at most 2 %", "at most 5 %"),
+        (
+            "one effect, clear or gross: named first",
+            fraction(named_first(case) for case in one if case.line.clear),
+            "97 %",
+            "90 %",
         ),
-        "right place, where the effect has one and its name is right": str(right_places(cases)),
-        "two effects: both named": both_named(two),
-        "two effects, each clear or gross: both named": both_named([case for case in two if case.line.clear]),
-        "outside the library: named as something else": str(
-            Share.of([_fails(case) for case in of_kind(cases, "outside")])
+        ("right place, where the effect has one and its name is right", str(right_places(cases)), "97 %", "90 %"),
+        ("two effects: both named", fraction(map(both_named, two)), "85 %", "70 %"),
+        ("two effects, each clear or gross: both named", fraction(both_named(case) for case in two if case.line.clear)),
+        (
+            "outside the library: named as something else",
+            fraction(map(_fails, of_kind(cases, "outside"))),
+            "at most 5 %",
+            "at most 10 %",
         ),
-        "parameter inside its own 95 % interval": str(Share.of([error.inside for error in parameter_errors(cases)[0]])),
-        f"probability above {SURE:g} claimed, and right": str(
-            Share.of(
-                [case.right(named, exact=False) for case in cases for named in case.named if named.probability > SURE]
-            )
+        (
+            "parameter inside its own 95 % interval",
+            fraction(error.inside for error in parameter_errors(cases)[0]),
+            "90 to 98 %",
+            "88 to 98 %",
         ),
-        "unseen record: updated within 0.1 (cluttered 0.33) of re-identified or 1.2 (1.5) of best possible": str(
-            Share.of([closes_the_gap(case) for case in cases if case.line.kind != "outside" and case.line.unseen])
+        (f"probability above {SURE:g} claimed, and right", fraction(sure), "97 %", "90 %"),
+        (
+            "unseen record: updated within 0.1 (cluttered 0.33) of re-identified or 1.2 (1.5) of best possible",
+            fraction(closed),
+            "each",
+            "each",
         ),
-        "unseen record: error of updated over re-identified": _spread(_ratios(cases, "baseline")),
-        "unseen record: error of updated over best possible": _spread(_ratios(cases, "best")),
-        "processor seconds": _spread([case.line.cpu_seconds for case in cases if case.line.cpu_seconds is not None]),
-    }
+        ("unseen record: error of updated over re-identified", _spread(_ratios(cases, "baseline"))),
+        ("unseen record: error of updated over best possible", _spread(_ratios(cases, "best"))),
+        ("processor seconds", _spread([case.line.cpu_seconds for case in cases if case.line.cpu_seconds is not None])),
+    ]
 
 
-def both_named(cases: Sequence[Judged]) -> str:
-    return str(Share.of([len(case.pairs) == 2 for case in cases]))
+def both_named(case: Judged) -> bool:
+    return len(case.pairs) == 2
 
 
 def closes_the_gap(case: Judged) -> bool:
-    """The updated model's error on the unseen record is small beside the re-identified one's, or close to the least."""
+    """On the unseen record, the updated model's error is small beside the re-identified one's, or hardly larger than
+    that of the best possible prediction."""
     unseen, (part, least) = case.line.unseen, (1 / 3, 1.5) if case.line.cluttered else (0.1, 1.2)
     assert unseen is not None
     return unseen.updated <= part * unseen.baseline or (

@@ -24,7 +24,7 @@ from avis_ctrl.rigs.rigid_body import point_map
 COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 # Coordinates whose frequencies are searched together: the low centre of mass of a frame couples x and ry, and y and rx.
 TOGETHER = (("x", "ry"), ("y", "rx"), *((coordinate,) for coordinate in COORDINATES))
-# Entries of the inverse mass matrix that these have.
+# Entries of the inverse mass matrix in these coordinates.
 ENTRIES = (*DIAGONAL, *(tuple(map(COORDINATES.index, group)) for group in TOGETHER[:2]))
 
 
@@ -44,8 +44,7 @@ class ChassisSettings:
     mass_ratio : ratio of the masses of two coordinates, up to which both can belong to one chassis [1].
     radius_m : smallest and largest radius of gyration [m] at which a fit starts.
     heights_m : height of the mass over the table's centre, and of the springs over the mass [m], at which a fit starts.
-    lines : lines of a record for the search around a fit: fewer than the fit's, because only the order of the groups of
-        coordinates matters.
+    lines : lines of a record for the search around a fit: fewer than the fit's, because it gives only starting values.
     narrowest : minimum damping ratio of the resonances searched around a fit [1]; a smaller one would need more
         frequencies, which are twice the half width apart.
     followed_groups : number of groups of coordinates whose new frequencies are fitted, the most promising first.
@@ -183,13 +182,14 @@ class BaseCompliance(OfMounts):
         A = np.array([recoils(around, partial(receptance, frequency_Hz=f, damping=damping), ENTRIES) for f in grid])
         found = []
         for group in TOGETHER:
-            if set(group) <= set(_coordinates(place)):
-                fixed = _with_frequencies(one, dict.fromkeys(group, SETTINGS.fixed_Hz))
-                now = recoil_of(around, partial(_difference, one.by_name, fixed.by_name))
-                rest = around.e + now
-                columns = [ENTRIES.index(entry) for entry in _entries(group)]
-                for chi2, values in _other_resonances(A[:, columns], rest, group, grid, one):
-                    found.append((chi2, _within(one, values)))
+            if not set(group) <= set(_coordinates(place)):
+                continue
+            fixed = one.by_name | {f"{coordinate}_Hz": SETTINGS.fixed_Hz for coordinate in group}
+            rest = around.e + recoil_of(around, partial(_difference, one.by_name, fixed))
+            own = set(map(COORDINATES.index, group))
+            columns = [k for k, entry in enumerate(ENTRIES) if set(entry) <= own]
+            if best := _other_resonances(A[:, columns], rest, group, grid, one):
+                found.append(best)
         return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < around.chi2]
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
@@ -237,17 +237,11 @@ def _difference(one: Values, other: Values, s: np.ndarray) -> np.ndarray:
     return _recoil(one, s)[0] - _recoil(other, s)[0]
 
 
-def _entries(group: Sequence[str]) -> list[tuple[int, ...]]:
-    """Entries of the inverse mass matrix that coordinates have."""
-    own = tuple(map(COORDINATES.index, group))
-    return [*((k, k) for k in own), *([own] if len(own) > 1 else [])]
-
-
 def _other_resonances(
     A: np.ndarray, rest: np.ndarray, group: Sequence[str], grid: np.ndarray, one: ActiveEffect
-) -> list[tuple[float, dict[str, float]]]:
-    """Sum of squares and new values of a chassis for the best resonances on the grid (n,) [Hz]: one of a single
-    coordinate; for two, also a pair of modes in which they are coupled.
+) -> tuple[float, tuple[float, ...]] | None:
+    """Sum of squares and values of the chassis with the best resonances on the grid (n,) [Hz]: a mode for each
+    coordinate of the group. None if no body has such resonances.
 
     A : (n, entries, N) directions. rest : (N,) residual without recoil in these coordinates.
     """
@@ -261,7 +255,7 @@ def _other_resonances(
         if best is None or whole - took.chi2 < best[0]:
             values = _body_of(group, took.coefficients.reshape(len(at), entries), grid[list(at)], one.by_name)
             best = (whole - took.chi2, values) if values else best
-    return [best] if best else []
+    return best and (best[0], _within(one, best[1]))
 
 
 def _body_of(group: Sequence[str], entries: np.ndarray, f: np.ndarray, now: Values) -> dict[str, float]:
@@ -308,15 +302,6 @@ def _radius(mass: float, inverse_inertia: float) -> float:
     """Radius of gyration [m] of a mass [kg] by the inverse of its moment of inertia [1/(kg m^2)]."""
     low, high = SETTINGS.radius_m
     return float(np.clip(1 / np.sqrt(inverse_inertia * mass), low, high)) if inverse_inertia > 0 else high
-
-
-def _with_frequencies(
-    one: ActiveEffect, frequencies: dict[str, float], radii: dict[str, float] | None = None
-) -> ActiveEffect:
-    """A chassis with other frequencies [Hz] of some coordinates, and other radii of gyration [m] of some rotations."""
-    values = one.by_name | {f"{coordinate}_Hz": f for coordinate, f in frequencies.items()}
-    values |= {f"gyration_{turn[1]}_m": radius for turn, radius in (radii or {}).items()}
-    return one.at(list(values.values()))
 
 
 def _resonances(score: Score, coordinates: Sequence[str]) -> tuple[dict[str, float], Reduction]:

@@ -13,11 +13,11 @@ from functools import lru_cache
 import numpy as np
 
 from avis_ctrl.gap.effects.base import EffectParameter
-from avis_ctrl.gap.score import Part, Score, symmetric_coordinates
+from avis_ctrl.gap.score import Score, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS
 from avis_ctrl.rigs.rigid_body import point_map
 
-# Entries of a symmetric matrix of the six coordinates.
+# Diagonal entries of a matrix in the six coordinates.
 DIAGONAL = tuple((k, k) for k in range(6))
 
 
@@ -118,8 +118,7 @@ def recoils(
     i, j = np.array(entries).T
     off = (i != j)[:, None, None, None]
     columns = []
-    for part in score.parts:
-        moved, force = _through_chassis(part)
+    for part, (moved, force) in zip(score.parts, _through_chassis(score), strict=True):
         out, force = np.moveaxis(moved, 2, 0)[..., None], np.moveaxis(force, 1, 0)[:, :, None]
         both = out[i] * force[j] + off * out[j] * force[i]
         columns.append(both * receptance(part.s[:, 0, 0])[:, None, None])
@@ -128,18 +127,20 @@ def recoils(
 
 def recoil_of(score: Score, recoil: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """(N,): direction of a recoil (n, 6, 6), displacement of the chassis per force on it, of s (n,)."""
-    columns = []
-    for part in score.parts:
-        moved, force = _through_chassis(part)
-        columns.append((moved @ recoil(part.s[:, 0, 0]) @ force)[None])
-    return score.directions(columns)[0]
+    both = zip(score.parts, _through_chassis(score), strict=True)
+    return score.directions([(moved @ recoil(part.s[:, 0, 0]) @ force)[None] for part, (moved, force) in both])[0]
 
 
-def _through_chassis(part: Part) -> tuple[np.ndarray, np.ndarray]:
-    """(n, n_y, 6) y per displacement of the chassis, and (n, 6, m) the force of the payload on it."""
-    made, response = part.made, part.response
-    through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-    return response.left[:, :, :6] @ through, -(part.s**2) * (made.M @ response.x[:, :6])
+def _through_chassis(score: Score) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For each block (n, n_y, 6) y per displacement of the chassis, and (n, 6, m) the force of the payload on it."""
+    if "through chassis" not in score.kept:
+        found = []
+        for part in score.parts:
+            made, response = part.made, part.response
+            through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
+            found.append((response.left[:, :, :6] @ through, -(part.s**2) * (made.M @ response.x[:, :6])))
+        score.kept["through chassis"] = found
+    return score.kept["through chassis"]
 
 
 def paths(score: Score, receptance: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
