@@ -27,7 +27,15 @@ from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, i
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
+from avis_ctrl.gap.tolerances import (
+    credible,
+    has_tolerance,
+    moved,
+    of_effect,
+    of_values,
+    tolerances_behind,
+    with_tolerance,
+)
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
@@ -103,8 +111,7 @@ def analyse(
     steps, best = _without_weak(fits.steps, fits.best, data, settings)
     more, best = outliers(best, data, known, settings, progress, each)
     fits = replace(fits, steps=(*steps, *more), best=best)
-    progress("validation of the effects on held-out records")
-    names = _names(fits, prepared, settings)
+    fits, names = _names(fits, prepared, known, progress, each, settings)
     return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
 
 
@@ -185,7 +192,26 @@ def _excess(base: Fitted, data: Data) -> float:
     return residual.nrmse**2 - residual.noise_nrmse**2
 
 
-def _names(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
+def _names(
+    fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
+) -> tuple[Fits, Names]:
+    """The names, and the fits with which they were found. Without an effect that is refused, values may move beyond
+    their tolerance; these are searched again."""
+    progress("validation of the effects on held-out records")
+    names = _judged(fits, prepared, settings)
+    if not names.refused:
+        return fits, names
+    progress("search without the effects that are refused")
+    data, best = prepared.data(prepared.fitted, settings.lines), names.updated
+    more = search(best, data, of_values(effects, best.model), settings, progress, each)
+    if not more:
+        return fits, names
+    kept = [step for step in fits.steps if step.label in best.labels]
+    again = _judged(replace(fits, steps=(*kept, *more), best=more[-1].fitted), prepared, settings)
+    return replace(fits, steps=(*fits.steps, *more)), replace(again, refused={**again.refused, **names.refused})
+
+
+def _judged(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
     """Name the effects that pass all checks: an effect must be more probable than its alternatives, have the same size
     in both halves of band and level, and make held-out records more likely."""
     data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
@@ -228,7 +254,7 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
         return reason
     if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
-    for half in halves(best, _judged(one), settings, absent=one.absent):
+    for half in halves(best, _constant(one), settings, absent=one.absent):
         if half.change > settings.law_change:
             return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""
@@ -248,7 +274,7 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
     return rest is not None and likelihood(best) > likelihood(rest)
 
 
-def _judged(one: ActiveEffect) -> list[str]:
+def _constant(one: ActiveEffect) -> list[str]:
     """Parameters of an effect on which halves of the data must agree: all except those that may end at their bounds."""
     return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.motion_estimate import clock_of
+from avis_ctrl.gap.effects.mounts import campaign_clock
 from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.result import NamedEffect
 from avis_ctrl.gap.settings import GapSettings
@@ -53,8 +53,9 @@ def converter_faults(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ..
 
 
 def predicted(campaign: Campaign, model: TableModel, each: Mapper = sequential_map) -> dict[str, np.ndarray]:
-    """(samples, n_y) sensor signals predicted by the model in every record, from rest."""
-    clock = clock_of(campaign)
+    """(samples, n_y) sensor signals predicted by the model in every record, from rest. A drift goes on as in the
+    campaign from which the model was found."""
+    clock = campaign_clock(model)
 
     def read(record: RecordSource) -> np.ndarray:
         h = record.header

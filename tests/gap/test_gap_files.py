@@ -420,6 +420,31 @@ def test_predictions_from_python_are_those_of_the_file(tmp_path):
     assert max(y[:, 0].max() for _, y in found) <= 0.5 < max(y[:, 0].max() for y, _ in found)
 
 
+def test_a_drift_goes_on_as_in_the_campaign_in_which_it_was_found(tmp_path):
+    """A record at 30 s of another, shorter campaign: early in a drift over 400 s, not at its end."""
+    effect = library()["stiffness_drift"]
+    found = RecordMotion(
+        "00",
+        1e3,
+        0.0,
+        (0.0, 400.0),
+        *(np.zeros((4, 8)), np.zeros((4, 12)), np.zeros((12, 6)), np.ones(12), np.zeros(12, bool), np.zeros(8, int)),
+    )
+    model = replace(BASE.with_effect(active(effect, BASE, "isolators/linear", [0.3])), motion={"00": found})
+    other, path, out = campaign_of(0.5), tmp_path / "gap", tmp_path / "pred.h5"
+    record = other.records[0]
+    other = replace(other, records=(replace(record, header=replace(record.header, start_s=30.0)),))
+    gap = replace(gap_of(), updated=model)
+    path.mkdir()
+    write_gap(path, gap)
+    write_gap_predictions(path, other, out)
+    ((_, y),) = predict(GapFinding(gap, other, (), {}), other)
+    expected = simulate(model, record.u, record.floor, 1e3, start_s=30.0, campaign_s=(0.0, 400.0)).y
+    np.testing.assert_allclose(y, expected, atol=1e-9)
+    with h5py.File(out) as file:
+        np.testing.assert_allclose(file["records/00/y_updated"], y, atol=1e-9)
+
+
 def test_predictions_at_the_limits(folder, tmp_path):
     """Drives beyond their limit clip, and so does the converter of the rig file."""
     campaign, out = campaign_of(12.0), tmp_path / "pred.h5"
