@@ -75,6 +75,12 @@ def figures(cases: Sequence[Judged]) -> list[tuple[str, ...]]:
         ("unseen record: error of updated over re-identified", _spread(_ratios(cases, "baseline"))),
         ("unseen record: error of updated over best possible", _spread(_ratios(cases, "best"))),
         ("processor seconds", _spread([case.line.cpu_seconds for case in cases if case.line.cpu_seconds is not None])),
+        (
+            "peak memory MB",
+            _spread([case.line.memory_MB for case in cases if case.line.memory_MB is not None]),
+            "at most 1500",
+            "at most 1500",
+        ),
     ]
 
 
