@@ -16,8 +16,8 @@ shape the effect (a frequency, a damping).
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple, Protocol
 
@@ -118,6 +118,28 @@ class EffectParameter:
     grid: tuple[float, ...] = ()
     optional: bool = False
 
+    @staticmethod
+    def shape(
+        name: str,
+        unit: str,
+        description: str,
+        low: float,
+        high: float,
+        size: float,
+        grid: Iterable[float],
+        *,
+        optional: bool = False,
+        none: float = 0.0,
+    ) -> EffectParameter:
+        """A parameter that is not linear: it shapes the effect."""
+        return EffectParameter(name, unit, description, none, low, high, size, False, tuple(map(float, grid)), optional)
+
+    def of_each(self, names: Iterable[int | str]) -> tuple[EffectParameter, ...]:
+        """The same parameter for each name, which replaces {} in name and description."""
+        return tuple(
+            replace(self, name=self.name.format(one), description=self.description.format(one)) for one in names
+        )
+
 
 @dataclass(frozen=True)
 class Reported:
@@ -144,12 +166,9 @@ class Added(NamedTuple):
     output: np.ndarray | None = None
 
 
-def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
+def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> tuple[EffectParameter, ...]:
     """Parameters of mounts, contacts or drives that differ from their mean; words has {} for the name."""
-    return (
-        EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
-        for one in names
-    )
+    return EffectParameter.shape("uneven_{}", "1", words, -most, most, 0.1, (0.0,), optional=True).of_each(names)
 
 
 def shares(values: Values) -> np.ndarray:

@@ -82,63 +82,21 @@ class BaseCompliance(OfMounts):
     resonant = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        m = model.rig.mounted_body().mass
-
-        def frequency(coordinate: str) -> EffectParameter:
-            about = f"along {coordinate}" if len(coordinate) == 1 else f"about {coordinate[1]}"
-            return EffectParameter(
-                f"{coordinate}_Hz",
-                "Hz",
-                f"of the chassis on its base, {about}",
-                0.0,
-                1.0,
-                300.0,
-                10.0,
-                False,
-                (20.0,),
-                True,
-            )
-
+        m, shape = model.rig.mounted_body().mass, partial(EffectParameter.shape, optional=True)
+        along = shape("{}_Hz", "Hz", "of the chassis on its base, along {}", 1.0, 300.0, 10.0, (20.0,))
         found = (
-            EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
-            EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
-            *(frequency(coordinate) for coordinate in COORDINATES[:3]),
+            EffectParameter.shape("mass_kg", "kg", "of the chassis", 0.05 * m, 400 * m, m, (2 * m,)),
+            shape("damping", "1", "damping ratio", 1e-3, 1.0, 0.05, (0.06,)),
+            *along.of_each("xyz"),
         )
         if place.endswith("translation"):
             return found
         return (
             *found,
-            *(frequency(coordinate) for coordinate in COORDINATES[3:]),
-            *(
-                EffectParameter(
-                    f"gyration_{axis}_m",
-                    "m",
-                    f"radius of gyration about {axis}",
-                    0.0,
-                    0.03,
-                    5.0,
-                    0.3,
-                    False,
-                    (0.5,),
-                    True,
-                )
-                for axis in "xyz"
-            ),
-            EffectParameter(
-                "centre_z_m",
-                "m",
-                "height of its mass over the table's centre",
-                0.0,
-                -3.0,
-                1.0,
-                0.3,
-                False,
-                (-0.5,),
-                True,
-            ),
-            EffectParameter(
-                "base_z_m", "m", "height of its springs over its mass", 0.0, -2.0, 2.0, 0.3, False, (0.0,), True
-            ),
+            *replace(along, name="r{}_Hz", description="of the chassis on its base, about {}").of_each("xyz"),
+            *shape("gyration_{}_m", "m", "radius of gyration about {}", 0.03, 5.0, 0.3, (0.5,)).of_each("xyz"),
+            shape("centre_z_m", "m", "height of its mass over the table's centre", -3.0, 1.0, 0.3, (-0.5,)),
+            shape("base_z_m", "m", "height of its springs over its mass", -2.0, 2.0, 0.3, (0.0,)),
         )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:

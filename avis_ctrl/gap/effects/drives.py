@@ -100,19 +100,10 @@ class ActuatorSaturation(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
-        peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
-        grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
-        limit = EffectParameter(
-            "limit_V",
-            "V",
-            "voltage at which the drives clip",
-            model.rig.drive_limit_V,
-            peak / 50,
-            peak,
-            peak,
-            False,
-            grid,
-        )
+        known = model.rig.drive_limit_V
+        peak, words = min(max(peaks), known) or known, "voltage at which the drives clip"
+        grid = [peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2)]
+        limit = EffectParameter.shape("limit_V", "V", words, peak / 50, peak, peak, grid, none=known)
         own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
         return (limit, *own)
 

@@ -99,18 +99,10 @@ class SensorResonance(UnnamedFault):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (
             EffectParameter("share", "1", "of the resonance in the output", 0.0, -5.0, 5.0, 0.01),
-            EffectParameter(
-                "frequency_Hz",
-                "Hz",
-                "of the resonance",
-                0.0,
-                0.5,
-                400.0,
-                1.0,
-                False,
-                tuple(np.geomspace(8.0, 90.0, 10)),
+            EffectParameter.shape(
+                "frequency_Hz", "Hz", "of the resonance", 0.5, 400.0, 1.0, np.geomspace(8.0, 90.0, 10)
             ),
-            EffectParameter("damping", "1", "its damping ratio", 0.0, 1e-3, 1.0, 0.02, False, (0.05,), True),
+            EffectParameter.shape("damping", "1", "its damping ratio", 1e-3, 1.0, 0.02, (0.05,), optional=True),
         )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:

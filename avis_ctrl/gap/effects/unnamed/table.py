@@ -56,10 +56,7 @@ class Gyroscope(UnnamedFault):
     at = ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(
-            EffectParameter(f"h{axis}_Nms", "N m s", f"angular momentum about {axis}", 0.0, -1e6, 1e6, 1.0)
-            for axis in "xyz"
-        )
+        return EffectParameter("h{}_Nms", "N m s", "angular momentum about {}", 0.0, -1e6, 1e6, 1.0).of_each("xyz")
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         x, y, z = (values[f"h{axis}_Nms"] for axis in "xyz")
