@@ -15,7 +15,7 @@ import numpy as np
 from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
+from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order

@@ -39,13 +39,15 @@ def axis_of(model: Table, sensor: str) -> str:
     return "xyz"[along[0]] if len(along) else ""
 
 
-class _OfSensor(Effect):
+class OfSensor(Effect):
+    """An effect of one sensor."""
+
     def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
 
 @register
-class GeophoneCorner(_OfSensor):
+class GeophoneCorner(OfSensor):
     """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter compensates a corner that does not exist.
 
     Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
@@ -76,7 +78,7 @@ class GeophoneCorner(_OfSensor):
 
 
 @register
-class SensorGain(_OfSensor):
+class SensorGain(OfSensor):
     """One sensitivity multiplied by a factor."""
 
     name = "sensor_gain"
@@ -91,7 +93,7 @@ class SensorGain(_OfSensor):
 
 
 @register
-class SensorMisalignment(_OfSensor):
+class SensorMisalignment(OfSensor):
     """Direction (e + a e1 + b e2)/norm instead of e; a, b are tangents of the tilt towards the two other earth axes."""
 
     name = "sensor_misalignment"
