@@ -25,8 +25,8 @@ from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remai
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, is_weak, outliers, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.signal_effects import levels, named, time_residuals
+from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.gap.tolerances import (
     credible,
     has_tolerance,
@@ -137,11 +137,6 @@ def _fits(
     return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
 
 
-def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
-    """The candidates, and faults that are fitted for comparison only."""
-    return [*effects, *unnamed_faults().values()]
-
-
 def _refitted(
     fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
 ) -> Fits:
@@ -163,7 +158,8 @@ def _searched(
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
 
-    steps = search(fits.best, data, _with_unnamed(effects), settings, progress, each, enough)
+    # The unnamed faults are fitted for comparison only.
+    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], settings, progress, each, enough)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
@@ -254,7 +250,9 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
         return reason
     if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
-    for half in halves(best, _constant(one), settings, absent=one.absent):
+    # Halves of the data must agree on all parameters except those that may end at their bounds.
+    constant = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
+    for half in halves(best, constant, settings, absent=one.absent):
         if half.change > settings.law_change:
             return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""
@@ -272,11 +270,6 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
         return True
     rest = without_effect(best, step.label, data, settings)
     return rest is not None and likelihood(best) > likelihood(rest)
-
-
-def _constant(one: ActiveEffect) -> list[str]:
-    """Parameters of an effect on which halves of the data must agree: all except those that may end at their bounds."""
-    return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 
 
 def _gap(
@@ -306,9 +299,17 @@ def _gap(
         for label, one in _chain(fits, updated, prepared, settings)
     ]
     found = [
-        _named(one, updated, names, power, after.nrmse**2, prepared)
-        for one in updated.model.effects
-        if one.label in updated.labels
+        NamedEffect(
+            one.effect.name,
+            name_of(one.label)[1],
+            one.effect.title,
+            one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names)),
+            names.probability[one.label],
+            names.rivals[one.label],
+            label=one.label,
+            share=share_of(updated.model, one.label, blocks, power, after.nrmse**2),
+        )
+        for one in map(updated.model.effect, updated.labels)
     ]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
@@ -320,7 +321,8 @@ def _gap(
     reported = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse**2 - noise
-    records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
+    sensors = {name: one.value for name, one in faults.noise.sensors.items()} if faults.noise else None
+    records, shares = every_record(prepared, fits.base.model, updated.model, sensors)
     remainder = Remainder(
         after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess), grows_faster(records)
     )
@@ -389,26 +391,6 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
 
 def _figures(residual: ModelResidual) -> tuple[float, float]:
     return residual.nrmse, residual.chi2_per_dof
-
-
-def _sensors(faults: SignalFaults) -> dict[str, float] | None:
-    return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
-
-
-def _named(
-    one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
-) -> NamedEffect:
-    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
-    return NamedEffect(
-        one.effect.name,
-        name_of(one.label)[1],
-        one.effect.title,
-        reported,
-        names.probability[one.label],
-        names.rivals[one.label],
-        label=one.label,
-        share=share_of(updated.model, one.label, prepared.held_out, power, with_it),
-    )
 
 
 def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power: Power) -> float:

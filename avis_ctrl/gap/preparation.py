@@ -112,7 +112,7 @@ def prepare(
             campaign = repair(clipped, rig, predicted(clipped, rough, each), converter).campaign
             halves = divide(campaign)
             rough = _rough(rough, halves, band, settings)
-    return _ready(campaign, halves, nominal, rough, band, converter, clipped, progress, each, settings)
+    return _ready(campaign, nominal, rough, band, converter, clipped, progress, each, settings)
 
 
 def mended_with(
@@ -122,19 +122,9 @@ def mended_with(
     assert prepared.clipped is not None
     expected = predicted(prepared.clipped, model, each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
-    rough = replace(prepared.rough, effects=())
-    return _ready(
-        campaign,
-        divide(campaign),
-        prepared.nominal,
-        rough,
-        prepared.band_Hz,
-        prepared.faults.converter,
-        prepared.clipped,
-        progress,
-        each,
-        settings,
-    )
+    rough, converter = replace(prepared.rough, effects=()), prepared.faults.converter
+    whole, band = prepared.clipped, prepared.band_Hz
+    return _ready(campaign, prepared.nominal, rough, band, converter, whole, progress, each, settings)
 
 
 def with_noise_from(prepared: Prepared, model: TableModel, each: Mapper) -> Prepared:
@@ -165,7 +155,6 @@ def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSetti
 
 def _ready(
     campaign: Campaign,
-    halves: Halves,
     nominal: TableModel,
     rough: TableModel,
     band: tuple[float, float],
@@ -176,7 +165,7 @@ def _ready(
     settings: GapSettings,
 ) -> Prepared:
     """Remove hum; compute spectra with noise, and the motion of every record with its second-order terms."""
-    residual = time_residuals(campaign, rough, each)
+    halves, residual = divide(campaign), time_residuals(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(residual)
     if hum is not None:

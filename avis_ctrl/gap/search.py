@@ -112,7 +112,12 @@ def extensions(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> lis
 
 
 def _priors_of(one: ActiveEffect, model: TableModel, settings: GapSettings) -> Priors:
-    return _with_known(of_effect(one, tolerances_of(model.rig), settings), model.priors)
+    """Priors of an effect's parameters, with those that it specifies itself (`Effect.priors`)."""
+    priors, known = of_effect(one, tolerances_of(model.rig), settings), model.priors
+    mean, sigma = priors.mean.copy(), priors.sigma.copy()
+    for row, name in enumerate(priors.names):
+        mean[row], sigma[row] = known.get(name, (mean[row], sigma[row]))
+    return replace(priors, mean=mean, sigma=sigma)
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
@@ -138,15 +143,6 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     rows = [fitted.priors.names.index(name) for name in model.names]
     priors = rescaled(fitted.priors, one, 1 / settings.held).of(model.names)
     return _try(fitted, model, priors, fitted.z[rows], data, settings)
-
-
-def _with_known(priors: Priors, known: Mapping[str, tuple[float, float]]) -> Priors:
-    """Priors with those that an effect specifies for parameters that records need not determine (`Effect.priors`)."""
-    rows = [priors.names.index(name) for name in known if name in priors.names]
-    mean, sigma = priors.mean.copy(), priors.sigma.copy()
-    for row in rows:
-        mean[row], sigma[row] = known[priors.names[row]]
-    return replace(priors, mean=mean, sigma=sigma)
 
 
 def _try(
