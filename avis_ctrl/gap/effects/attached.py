@@ -93,9 +93,8 @@ class AttachedOscillator(AtPoint):
         frequencies = (*np.geomspace(grid[0], grid[-1], count), SETTINGS.stiff_Hz)
         others = [k for k in range(3) if k != first]
         points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
-        pair, point = _along_the_others(
-            score, values["damping"], frequencies, points, "".join("xyz"[k] for k in others)
-        )
+        axes = "".join("xyz"[k] for k in others)
+        pair, point = _along_the_others(score, values["damping"], frequencies, points, axes)
         frequency = np.full(3, values["frequency_Hz"])
         frequency[others] = pair
         return [("payload/axes", tuple(map(float, (mass, *frequency, values["damping"], *point))))]
@@ -112,12 +111,8 @@ class AttachedOscillator(AtPoint):
         if not np.any(along(values)):
             return found
         line = reported_line(values, covariance, "mass_kg", "kg")
-        return {
-            "mass_kg": line.pop("mass_kg"),
-            "frequency_Hz": found["frequency_Hz"],
-            "damping": found["damping"],
-            **line,
-        }
+        own = {name: found[name] for name in ("frequency_Hz", "damping")}
+        return {"mass_kg": line.pop("mass_kg"), **own, **line}
 
 
 def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
@@ -130,14 +125,8 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
     if variant == "turned":
         rows = Rotation.from_rotvec([values[f"turn_{axis}"] for axis in "xyz"]).as_matrix().T @ rows
     axes = "xyz" if variant in THREE_AXES else variant
-    return [
-        (
-            rows["xyz".index(axis)],
-            values["mass_kg"],
-            values[f"frequency_{axis}_Hz" if variant in THREE_AXES else "frequency_Hz"],
-        )
-        for axis in axes
-    ]
+    name = "frequency_{}_Hz" if variant in THREE_AXES else "frequency_Hz"
+    return [(rows["xyz".index(axis)], values["mass_kg"], values[name.format(axis)]) for axis in axes]
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:

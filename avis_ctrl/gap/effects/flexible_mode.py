@@ -74,11 +74,8 @@ class PayloadFlexibleMode(Effect):
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
         for frequency, zeta, shape in modes(values):
             if np.any(shape):
-                ops.added.append(
-                    AddedCoordinate(
-                        second_order(ops.s, frequency, zeta), shape, at_actuators @ shape, at_sensors @ shape
-                    )
-                )
+                stiffness = second_order(ops.s, frequency, zeta)
+                ops.added.append(AddedCoordinate(stiffness, shape, at_actuators @ shape, at_sensors @ shape))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Residues over all paths at the frequencies that reduce chi-square most; the shape is their symmetric part of
