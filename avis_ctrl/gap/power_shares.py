@@ -234,7 +234,7 @@ def split(lines: Lines, edges: np.ndarray) -> Split:
         found[:, b] /= max(count[b], 1)
         noise = lines.noise[low:high]
         alike[b] = np.sum(noise, axis=0) ** 2 / np.sum(noise**2, axis=0)
-    return Split(*found, count, alike)
+    return Split(found[0], found[1], found[2], found[3], found[4], count, alike)
 
 
 def _window(lines: Lines, at: np.ndarray) -> np.ndarray:

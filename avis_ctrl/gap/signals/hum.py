@@ -136,11 +136,11 @@ def find_hum(residuals: Sequence[RecordResidual]) -> HumFinding | None:
     frequency = _refined(residuals, frequency.value, hits)
     lines = _lines(residuals, frequency.value, hits, there.ratio[0])
     largest, header, nominal = lines[0], residuals[0].header, best.nominal_Hz
-    at = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
+    lines_Hz = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
     channels = sorted({line.channel for line in lines}, key=header.y_names.index)
     A = largest.amplitude
     sentence = (
-        f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
+        f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {lines_Hz} Hz in"
         f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
         f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{header.y_unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
         " the lines next to it."
