@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +15,9 @@ import numpy as np
 from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
+from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
-from avis_ctrl.gap.parallel import Mapper, sequential_map
+from avis_ctrl.gap.parallel import Mapper, Progress, Run, sequential_map
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
 from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
@@ -25,8 +25,8 @@ from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remai
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, is_weak, outliers, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
-from avis_ctrl.gap.signal_effects import SignalFaults, levels, named, time_residuals
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.signal_effects import levels, named, time_residuals
+from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.gap.tolerances import (
     credible,
     has_tolerance,
@@ -41,8 +41,6 @@ from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, f
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,31 +92,28 @@ def analyse(
     InputError : no record drives an actuator, or the noise cannot be estimated.
     """
     began = time.monotonic()
-    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, progress, each, settings)
+    prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, Run(settings, progress, each))
     known = list(library().values()) if effects is None else list(effects)
-    fits = _fits(prepared, rig, known, progress, each, settings)
+    fits = _fits(prepared, rig, known)
     if prepared.clipped is not None and fits.steps:
         progress("clipped samples: replaced by the prediction of the model with its effects")
-        prepared = mended_with(prepared, fits.best.model, progress, each, settings)
-        fits = _fits(prepared, rig, known, progress, each, settings)
+        prepared = mended_with(prepared, fits.best.model)
+        fits = _fits(prepared, rig, known)
     residual = ModelResidual.of(fits.best.model, prepared.held_out)
     if prepared.local_noise and residual.noise_nrmse**2 > settings.within_noise * residual.nrmse**2:
         # A local polynomial model counts distortion as noise; the model with its effects may predict it.
         progress("noise estimated again, with the effects that were found")
-        prepared = with_noise_from(prepared, fits.best.model, each)
-        fits = _refitted(fits, prepared, known, progress, each, settings)
-    data = prepared.data(prepared.fitted, settings.lines)
-    steps, best = _without_weak(fits.steps, fits.best, data, settings)
-    more, best = outliers(best, data, known, settings, progress, each)
+        prepared = with_noise_from(prepared, fits.best.model)
+        fits = _refitted(fits, prepared, known)
+    steps, best = _without_weak(fits.steps, fits.best, prepared.fit_data, settings)
+    more, best = outliers(best, prepared.fit_data, known, prepared.run)
     fits = replace(fits, steps=(*steps, *more), best=best)
-    fits, names = _names(fits, prepared, known, progress, each, settings)
-    return _gap(prepared, fits, names, known, seed, began, progress, each, settings)
+    fits, names = _names(fits, prepared, known)
+    return _gap(prepared, fits, names, known, seed, began)
 
 
-def _fits(
-    prepared: Prepared, rig: Rig, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
-) -> Fits:
-    data = prepared.data(prepared.fitted, settings.lines)
+def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
+    data, settings, progress = prepared.fit_data, prepared.run.settings, prepared.run.progress
     progress("fit of mass, inertia, stiffness and damping")
     start, nominal = prepared.rough, prepared.nominal.base
     large = of_effect(start.effects[0], tolerances_of(rig), settings)
@@ -134,28 +129,20 @@ def _fits(
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    return _searched(Fits(base, tolerant, (), tolerant), data, effects, progress, each, settings)
+    return _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
 
 
-def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
-    """The candidates, and faults that are fitted for comparison only."""
-    return [*effects, *unnamed_faults().values()]
-
-
-def _refitted(
-    fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
-) -> Fits:
+def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """Refit the last model with the new noise estimate and continue the search from there. Effects found before are
     still judged with the noise estimate with which they were found."""
-    data, best = prepared.data(prepared.fitted, settings.lines), fits.best
-    best = fit(best.model, best.priors, best.z, data, best.variances, settings)
-    return _searched(replace(fits, best=best), data, effects, progress, each, settings)
+    best = fits.best
+    best = fit(best.model, best.priors, best.z, prepared.fit_data, best.variances, prepared.run.settings)
+    return _searched(replace(fits, best=best), prepared, effects)
 
 
-def _searched(
-    fits: Fits, data: Data, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
-) -> Fits:
+def _searched(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
+    data, settings = prepared.fit_data, prepared.run.settings
     ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
 
     def enough(step: Step) -> bool:
@@ -163,7 +150,8 @@ def _searched(
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
 
-    steps = search(fits.best, data, _with_unnamed(effects), settings, progress, each, enough)
+    # The unnamed faults are fitted for comparison only.
+    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], prepared.run, enough)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
@@ -192,29 +180,28 @@ def _excess(base: Fitted, data: Data) -> float:
     return residual.nrmse**2 - residual.noise_nrmse**2
 
 
-def _names(
-    fits: Fits, prepared: Prepared, effects: Sequence[Effect], progress: Progress, each: Mapper, settings: GapSettings
-) -> tuple[Fits, Names]:
+def _names(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> tuple[Fits, Names]:
     """The names, and the fits with which they were found. Without an effect that is refused, values may move beyond
     their tolerance; these are searched again."""
-    progress("validation of the effects on held-out records")
-    names = _judged(fits, prepared, settings)
+    run = prepared.run
+    run.progress("validation of the effects on held-out records")
+    names = _judged(fits, prepared)
     if not names.refused:
         return fits, names
-    progress("search without the effects that are refused")
-    data, best = prepared.data(prepared.fitted, settings.lines), names.updated
-    more = search(best, data, of_values(effects, best.model), settings, progress, each)
+    run.progress("search without the effects that are refused")
+    best = names.updated
+    more = search(best, prepared.fit_data, of_values(effects, best.model), run)
     if not more:
         return fits, names
     kept = [step for step in fits.steps if step.label in best.labels]
-    again = _judged(replace(fits, steps=(*kept, *more), best=more[-1].fitted), prepared, settings)
+    again = _judged(replace(fits, steps=(*kept, *more), best=more[-1].fitted), prepared)
     return replace(fits, steps=(*fits.steps, *more)), replace(again, refused={**again.refused, **names.refused})
 
 
-def _judged(fits: Fits, prepared: Prepared, settings: GapSettings) -> Names:
+def _judged(fits: Fits, prepared: Prepared) -> Names:
     """Name the effects that pass all checks: an effect must be more probable than its alternatives, have the same size
     in both halves of band and level, and make held-out records more likely."""
-    data, held = (prepared.data(blocks, settings.lines) for blocks in (prepared.fitted, prepared.held_out))
+    data, held, settings = prepared.fit_data, prepared.held_data, prepared.run.settings
     best, probability, rivals, refused = fits.best, {}, {}, {}
     for step in fits.steps:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
@@ -254,7 +241,9 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
         return reason
     if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
-    for half in halves(best, _constant(one), settings, absent=one.absent):
+    # Halves of the data must agree on all parameters except those that may end at their bounds.
+    constant = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
+    for half in halves(best, constant, settings, absent=one.absent):
         if half.change > settings.law_change:
             return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
     return ""
@@ -274,24 +263,9 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
     return rest is not None and likelihood(best) > likelihood(rest)
 
 
-def _constant(one: ActiveEffect) -> list[str]:
-    """Parameters of an effect on which halves of the data must agree: all except those that may end at their bounds."""
-    return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
-
-
-def _gap(
-    prepared: Prepared,
-    fits: Fits,
-    names: Names,
-    effects: Sequence[Effect],
-    seed: int,
-    began: float,
-    progress: Progress,
-    each: Mapper,
-    settings: GapSettings,
-) -> Gap:
+def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect], seed: int, began: float) -> Gap:
     """Assemble the result; stages, maps and sentences are computed on held-out records."""
-    blocks, updated = prepared.held_out, names.updated
+    blocks, updated, settings, progress = prepared.held_out, names.updated, prepared.run.settings, prepared.run.progress
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
     raw = ModelResidual.of(fits.base.model, prepared.unmasked)
     noise = after.noise_nrmse**2
@@ -303,24 +277,33 @@ def _gap(
     ]
     stages += [
         Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
-        for label, one in _chain(fits, updated, prepared, settings)
+        for label, one in _chain(fits, updated, prepared)
     ]
     found = [
-        _named(one, updated, names, power, after.nrmse**2, prepared)
-        for one in updated.model.effects
-        if one.label in updated.labels
+        NamedEffect(
+            one.effect.name,
+            name_of(one.label)[1],
+            one.effect.title,
+            one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names)),
+            names.probability[one.label],
+            names.rivals[one.label],
+            label=one.label,
+            share=share_of(updated.model, one.label, blocks, power, after.nrmse**2),
+        )
+        for one in map(updated.model.effect, updated.labels)
     ]
     faults = prepared.faults
     if after.chi2_per_dof <= settings.known_noise:
         progress("noise of floor and sensors")
-        residual = time_residuals(prepared.campaign, updated.model, each)
+        residual = time_residuals(prepared.campaign, updated.model, prepared.run.each)
         faults = replace(faults, noise=levels(residual, updated.model, faults.hum, faults.converter))
     found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
     reported = tuple(one for one in found if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in found if (one.share or 0.0) < settings.trace)
     excess = after.nrmse**2 - noise
-    records, shares = every_record(prepared, fits.base.model, updated.model, _sensors(faults))
+    sensors = {name: one.value for name, one in faults.noise.sensors.items()} if faults.noise else None
+    records, shares = every_record(prepared, fits.base.model, updated.model, sensors)
     remainder = Remainder(
         after.nrmse, after.nrmse / max(after.noise_nrmse, 1e-300), power.share(excess), grows_faster(records)
     )
@@ -335,8 +318,7 @@ def _gap(
     limits: tuple[Detectable, ...] = ()
     if verdict == "none":
         progress("detection limits of the effects")
-        data = prepared.data(prepared.fitted, settings.lines)
-        limits = detection_limits(EvidenceScore(fits.tolerant, data, settings), effects)
+        limits = detection_limits(EvidenceScore(fits.tolerant, prepared.fit_data, settings), effects)
     sentences = (
         _opening(verdict, reported, traces, stages, remainder, after),
         imitated,
@@ -354,7 +336,7 @@ def _gap(
         onward,
         fits.base.model,
         updated.model,
-        _considered(fits, names, prepared, settings),
+        _considered(fits, names, prepared),
         heat_map(before, after),
         tuple(one for one in sentences if one),
         prepared.halves.how,
@@ -371,9 +353,9 @@ def _gap(
     )
 
 
-def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSettings) -> list[tuple[str, Fitted]]:
+def _chain(fits: Fits, updated: Fitted, prepared: Prepared) -> list[tuple[str, Fitted]]:
     """The models from the one with tolerances to the updated one, each with one more effect, in order of finding."""
-    found, data = [], prepared.data(prepared.fitted, settings.lines)
+    found = []
     one: Fitted | None = updated
     for label in reversed(updated.labels):
         if one is None:
@@ -383,32 +365,12 @@ def _chain(fits: Fits, updated: Fitted, prepared: Prepared, settings: GapSetting
         if not before:
             break
         known = next((step.fitted for step in fits.steps if set(step.fitted.labels) == before), None)
-        one = known or without_effect(one, label, data, settings.quick)
+        one = known or without_effect(one, label, prepared.fit_data, prepared.run.settings.quick)
     return found[::-1]
 
 
 def _figures(residual: ModelResidual) -> tuple[float, float]:
     return residual.nrmse, residual.chi2_per_dof
-
-
-def _sensors(faults: SignalFaults) -> dict[str, float] | None:
-    return None if faults.noise is None else {name: one.value for name, one in faults.noise.sensors.items()}
-
-
-def _named(
-    one: ActiveEffect, updated: Fitted, names: Names, power: Power, with_it: float, prepared: Prepared
-) -> NamedEffect:
-    reported = one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names))
-    return NamedEffect(
-        one.effect.name,
-        name_of(one.label)[1],
-        one.effect.title,
-        reported,
-        names.probability[one.label],
-        names.rivals[one.label],
-        label=one.label,
-        share=share_of(updated.model, one.label, prepared.held_out, power, with_it),
-    )
 
 
 def _share_of_signal(name: str, raw: ModelResidual, masked: ModelResidual, power: Power) -> float:
@@ -464,9 +426,9 @@ def _far(fitted: Fitted, settings: GapSettings) -> str:
     )
 
 
-def _considered(fits: Fits, names: Names, prepared: Prepared, settings: GapSettings) -> tuple[Considered, ...]:
+def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considered, ...]:
     """Effects that were fitted but not named, the most probable first."""
-    rows, thin = [], prepared.data(prepared.held_out, settings.lines).blocks
+    rows, thin, settings = [], prepared.held_data.blocks, prepared.run.settings
     for number, step in enumerate(fits.steps, 1):
         best = max(step.tried.values(), key=lambda one: one.log_evidence)
         top = best.log_evidence

@@ -22,8 +22,8 @@ from avis_ctrl.gap.table_response import Acting, TableResponse
 
 
 @dataclass(frozen=True)
-class RecordLineSettings:
-    """Settings of the response on the lines of a whole record.
+class SimulationSettings:
+    """Settings of the simulation of whole records: response on their lines, and forces solved in windows of time.
 
     quiet_s : silence after a record [s]; with 1 % damping at 1.5 Hz, motion decays to 0.4 %.
     highest_Hz : lines above this are set to zero [Hz]: there only the inertia of a table matters, and it moves little.
@@ -31,6 +31,13 @@ class RecordLineSettings:
     chunk : number of lines for which the table is assembled at once; limits memory.
     most_samples : maximum number of samples of a record that fits into memory in one piece (padded: about 2 kB per
         sample).
+    window_s : length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
+    window_tolerance : a window has converged when its deflection changes by less than this fraction of the largest one
+        so far [1].
+    most_iterations : maximum fixed-point iterations in a window before it is divided into more pieces.
+    pieces : numbers of pieces of a window, tried in this order until the iteration contracts; 2^20 for single samples.
+    defect : maximum residual of the equation of motion over the deflection, r.m.s. [1]: far below any sensor's noise.
+    most_passes : maximum number of passes over the record before the simulation counts as not converging.
     """
 
     quiet_s: float = 60.0
@@ -38,9 +45,15 @@ class RecordLineSettings:
     lowest_line: float = 0.01
     chunk: int = 8192
     most_samples: int = 1_000_000
+    window_s: float = 0.05
+    window_tolerance: float = 1e-9
+    most_iterations: int = 40
+    pieces: tuple[int, ...] = (1, 8, 1 << 20)
+    defect: float = 1e-5
+    most_passes: int = 12
 
 
-SETTINGS = RecordLineSettings()
+SETTINGS = SimulationSettings()
 
 
 class LineResponse:

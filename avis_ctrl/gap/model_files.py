@@ -127,8 +127,17 @@ def model_from_dict(content: Mapping[str, Any]) -> tuple[TableModel, tuple[float
     ------
     InputError : a missing, unknown or wrong field, an effect that is not in the library, or an impossible rig.
     """
-    checked = _checked(content)
+    checked = validated(ModelFile, content)
     begin, end = checked.campaign_s
+    if begin >= end:
+        raise InputError("expected the first time before the last one", field="campaign_s", value=checked.campaign_s)
+    if len(checked.sensitivity) != len(checked.sensors):
+        words = f"expected {len(checked.sensors)} values, one for each sensor"
+        raise InputError(words, field="sensitivity", value=checked.sensitivity)
+    for field in ("sensors", "actuators", "free"):
+        names = getattr(checked, field)
+        if len(set(names)) != len(names):
+            raise InputError("expected different names", field=field, value=names)
     return _made(checked), (begin, end)
 
 
@@ -142,23 +151,6 @@ def read_model(path: str | Path) -> tuple[TableModel, tuple[float, float]]:
         return model_from_dict(content)
     except InputError as error:
         raise error.in_file(path) from None
-
-
-def _checked(content: Mapping[str, Any]) -> ModelFile:
-    checked = validated(ModelFile, content)
-    if checked.campaign_s[0] >= checked.campaign_s[1]:
-        raise InputError("expected the first time before the last one", field="campaign_s", value=checked.campaign_s)
-    if len(checked.sensitivity) != len(checked.sensors):
-        raise InputError(
-            f"expected {len(checked.sensors)} values, one for each sensor",
-            field="sensitivity",
-            value=checked.sensitivity,
-        )
-    for field in ("sensors", "actuators", "free"):
-        names = getattr(checked, field)
-        if len(set(names)) != len(names):
-            raise InputError("expected different names", field=field, value=names)
-    return checked
 
 
 def _made(file: ModelFile) -> TableModel:
@@ -176,11 +168,8 @@ def _made(file: ModelFile) -> TableModel:
     ):
         raise InputError("expected geophones of the model", field="suspensions", value=unknown)
     own = tuple(
-        (f, z) if (f, z) != (0, 0) else None
-        for f, z in (
-            file.suspensions.get(name, old or (0, 0))
-            for name, old in zip(sensors.names, sensors.suspensions, strict=False)
-        )
+        (pair[0], pair[1]) if (pair := file.suspensions.get(name)) else old
+        for name, old in zip(sensors.names, sensors.suspensions, strict=False)
     )
     sensors = replace(sensors, sensitivity=np.array(file.sensitivity), suspensions=own)
     base = ResponseModel(

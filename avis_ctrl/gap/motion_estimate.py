@@ -10,7 +10,7 @@ is zero where it does not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.fft
@@ -18,39 +18,12 @@ import scipy.fft
 from avis_ctrl.gap.line_response import LineResponse, line_response
 from avis_ctrl.gap.operators import Assembled, mount_geometry
 from avis_ctrl.gap.parallel import Mapper, sequential_map
-from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.record_motion import SETTINGS, RecordMotion
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.large_motion import second_order
 from avis_ctrl.identification.predictor import model_inputs
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
-
-
-@dataclass(frozen=True)
-class RecordMotionSettings:
-    """Settings of the estimated motion of the mounts in a measured record.
-
-    low_Hz : lower edge of the band in which the sensors correct the model; the correction rises from zero to full [Hz].
-        Below, inverting the sensor response would amplify sensor noise.
-    high_Hz : upper edge of that band; the correction falls from full to zero [Hz]. Above, the mounts deflect little.
-    least_excess : lower limit of the power attributed to a force, in standard deviations of the power of noise alone
-        [1]: next to none, but not zero. A limit of one or more would attribute noise to a force.
-    noise_from : fraction of the band above which only noise remains; its power is that of the sensors [1].
-    margin_s : length by which a record is extrapolated beyond its ends [s]: several periods of a table's lowest mode.
-    passes : iterations of this extrapolation.
-    relaxation : over-relaxation of these iterations [1]: a plain iteration reduces the error by only a fifth.
-    """
-
-    low_Hz: tuple[float, float] = (0.4, 0.8)
-    high_Hz: tuple[float, float] = (120.0, 150.0)
-    least_excess: float = 0.02
-    noise_from: float = 0.6
-    margin_s: float = 5.0
-    passes: int = 6
-    relaxation: float = 1.8
-
-
-SETTINGS = RecordMotionSettings()
 
 
 def motion_of(

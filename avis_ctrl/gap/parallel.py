@@ -1,10 +1,14 @@
-"""Run independent calculations: one after the other, or in parallel with a function that the caller provides."""
+"""How a search runs: its settings, its progress, and independent calculations one by one or in parallel."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
+from avis_ctrl.gap.settings import SETTINGS, GapSettings
+
+Progress = Callable[[str], None]
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -20,3 +24,12 @@ class Mapper(Protocol):
 def sequential_map(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Run the calculations one after the other."""
     return [function(item) for item in items]
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a search runs: settings, progress in words, and a function for independent calculations."""
+
+    settings: GapSettings = SETTINGS
+    progress: Progress = lambda text: None
+    each: Mapper = sequential_map

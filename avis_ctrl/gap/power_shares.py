@@ -20,7 +20,7 @@ nonlinear.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Literal
 
@@ -86,14 +86,7 @@ class Lines:
 
     def some(self, keep: np.ndarray) -> Lines:
         """Some of the lines."""
-        return Lines(
-            self.frequency_Hz[keep],
-            self.Y[keep],
-            self.left[keep],
-            self.beyond[keep],
-            self.columns[keep],
-            self.noise[keep],
-        )
+        return Lines(*(getattr(self, one.name)[keep] for one in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,24 +137,10 @@ def power_shares(
     made = []
     for (own, _), one in zip(found, splits, strict=True):
         noise = one.noise if how == "silent" else lowest if how == "levels" else one.left_incoherent
-        parts = attributed(one, noise, sensors)
-        whole = {
-            key: np.sum(value * (one.whole * one.lines[:, None]), axis=0)
-            / np.sum(one.whole * one.lines[:, None], axis=0)
-            for key, value in parts.items()
-        }
-        made.append(
-            PowerShares(
-                float(np.mean([h.level_V for h in own])),
-                own[0].excitation,
-                tuple(sorted(h.name for h in own)),
-                edges,
-                names,
-                parts,
-                whole,
-                how,
-            )
-        )
+        parts, power = attributed(one, noise, sensors), one.whole * one.lines[:, None]
+        whole = {key: np.sum(value * power, axis=0) / np.sum(power, axis=0) for key, value in parts.items()}
+        level, records = float(np.mean([h.level_V for h in own])), tuple(sorted(h.name for h in own))
+        made.append(PowerShares(level, own[0].excitation, records, edges, names, parts, whole, how))
     return tuple(made)
 
 
@@ -212,7 +191,7 @@ def lines_of(errors: Sequence[PredictionError], model: TableModel) -> Lines:
         Y = predicted + residual
         every = Lines(block.omega / (2 * np.pi), Y, residual, Y - columns.sum(axis=2), columns, noise)
         made.append(every.some(power > FIT.silent_line**2 * power.max(initial=0.0)))
-    joined = Lines(*(np.concatenate([getattr(one, field) for one in made]) for field in Lines.__dataclass_fields__))
+    joined = Lines(*(np.concatenate([getattr(one, field.name) for one in made]) for field in fields(Lines)))
     return joined.some(np.argsort(joined.frequency_Hz, kind="stable"))
 
 

@@ -7,8 +7,9 @@ accurate enough to distinguish noise and hum from the response.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,8 +17,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
-from avis_ctrl.gap.parallel import Mapper, sequential_map
-from avis_ctrl.gap.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.parallel import Run
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
 from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
@@ -35,7 +36,6 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record
 from avis_ctrl.rigs.rig import Rig
 
-Progress = Callable[[str], None]
 # Second-order terms by Newton-Euler, with sensors fixed to the payload and forces along the earth axes.
 BY_PHYSICS = (1.0, 0.0, 1.0)
 
@@ -47,7 +47,8 @@ class Prepared:
     campaign : without hum and clipping. fitted, held_out : spectra of all lines, with noise. unmasked : the held-out
         spectra including the lines polluted by hum. noise : a sentence on the source of the noise. nominal : the rig as
         in its file. rough : the first fit. faults : of the signals. clipped : the campaign before the repair of clipped
-        samples, None if there are few. left : residual of the rough model in each record, in time.
+        samples, None if there are few. left : residual of the rough model in each record, in time. run : how the search
+        runs.
     """
 
     campaign: Campaign
@@ -61,26 +62,32 @@ class Prepared:
     rough: TableModel
     faults: SignalFaults
     left: tuple[RecordResidual, ...]
-    clipped: Campaign | None = None
+    clipped: Campaign | None
+    run: Run
 
     @property
     def local_noise(self) -> bool:
         """Whether the noise is that of a local polynomial model of driven records, which includes their distortion."""
         return not all_silent(self.halves.fitted, self.fitted)
 
-    def data(self, blocks: Sequence[SpectralBlock], lines: int) -> Data:
+    @cached_property
+    def fit_data(self) -> Data:
+        """Lines of the fitted records for a fit."""
+        return self._data(self.fitted)
+
+    @cached_property
+    def held_data(self) -> Data:
+        """Lines of the held-out records."""
+        return self._data(self.held_out)
+
+    def _data(self, blocks: Sequence[SpectralBlock]) -> Data:
         """Some lines of blocks, with the level of the group of records to which each block belongs."""
-        return Data.of(blocks, levels_of((*self.halves.fitted.records, *self.halves.held_out.records)), lines)
+        records = (*self.halves.fitted.records, *self.halves.held_out.records)
+        return Data.of(blocks, levels_of(records), self.run.settings.lines)
 
 
 def prepare(
-    campaign: Campaign,
-    rig: Rig,
-    band_Hz: tuple[float, float] | None = None,
-    amplifier_corner_Hz: float | None = None,
-    progress: Progress = lambda text: None,
-    each: Mapper = sequential_map,
-    settings: GapSettings = SETTINGS,
+    campaign: Campaign, rig: Rig, band_Hz: tuple[float, float] | None, amplifier_corner_Hz: float | None, run: Run
 ) -> Prepared:
     """Compute spectra with noise from the records.
 
@@ -89,6 +96,7 @@ def prepare(
     InputError : a band without excitation, too few lines, no record that drives an actuator, or noise that cannot be
         estimated.
     """
+    settings, progress = run.settings, run.progress
     progress("converters; choice of the held-out records")
     converter = converter_faults(campaign, rig)
     mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
@@ -109,38 +117,25 @@ def prepare(
     if clipped is not None:
         progress("clipped samples: replaced by the prediction of the model")
         for _ in range(settings.repairs):
-            campaign = repair(clipped, rig, predicted(clipped, rough, each), converter).campaign
+            campaign = repair(clipped, rig, predicted(clipped, rough, run.each), converter).campaign
             halves = divide(campaign)
             rough = _rough(rough, halves, band, settings)
-    return _ready(campaign, halves, nominal, rough, band, converter, clipped, progress, each, settings)
+    return _ready(campaign, nominal, rough, band, converter, clipped, run)
 
 
-def mended_with(
-    prepared: Prepared, model: TableModel, progress: Progress, each: Mapper, settings: GapSettings
-) -> Prepared:
+def mended_with(prepared: Prepared, model: TableModel) -> Prepared:
     """Repair the clipped samples again, with the prediction of a better model."""
     assert prepared.clipped is not None
-    expected = predicted(prepared.clipped, model, each)
+    expected = predicted(prepared.clipped, model, prepared.run.each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
-    rough = replace(prepared.rough, effects=())
-    return _ready(
-        campaign,
-        divide(campaign),
-        prepared.nominal,
-        rough,
-        prepared.band_Hz,
-        prepared.faults.converter,
-        prepared.clipped,
-        progress,
-        each,
-        settings,
-    )
+    rough, converter, band = replace(prepared.rough, effects=()), prepared.faults.converter, prepared.band_Hz
+    return _ready(campaign, prepared.nominal, rough, band, converter, prepared.clipped, prepared.run)
 
 
-def with_noise_from(prepared: Prepared, model: TableModel, each: Mapper) -> Prepared:
+def with_noise_from(prepared: Prepared, model: TableModel) -> Prepared:
     """Estimate the noise again, from the residual of a better model."""
     groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
-    residual = time_residuals(prepared.campaign, model, each)
+    residual = time_residuals(prepared.campaign, model, prepared.run.each)
     (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, residual, prepared.rough, prepared.band_Hz)
     return replace(prepared, fitted=tuple(fitted), held_out=tuple(held_out), unmasked=tuple(unmasked), noise=how)
 
@@ -165,18 +160,16 @@ def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSetti
 
 def _ready(
     campaign: Campaign,
-    halves: Halves,
     nominal: TableModel,
     rough: TableModel,
     band: tuple[float, float],
     converter: tuple[ConverterFinding, ...],
     clipped: Campaign | None,
-    progress: Progress,
-    each: Mapper,
-    settings: GapSettings,
+    run: Run,
 ) -> Prepared:
     """Remove hum; compute spectra with noise, and the motion of every record with its second-order terms."""
-    residual = time_residuals(campaign, rough, each)
+    settings, progress, each = run.settings, run.progress, run.each
+    halves, residual = divide(campaign), time_residuals(campaign, rough, each)
     raw_held = blocks_of(halves.held_out, rough, band)
     hum = find_hum(residual)
     if hum is not None:
@@ -204,6 +197,7 @@ def _ready(
         SignalFaults(converter, hum),
         residual,
         clipped,
+        run,
     )
 
 

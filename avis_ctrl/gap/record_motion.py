@@ -12,16 +12,32 @@ import scipy.fft
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """Settings of the spectra of a record's motion.
+    """Settings of the motion of the mounts in a measured record: its spectra, and its estimate (`motion_estimate`).
 
     kept_bytes : maximum size of the spectra cached for each record; the least recently used go first. Enough for a step
         of a fit with several effects; ten such records take a fifth of the memory allowed for a search.
     node_ratio : ratio of the values between which spectra are interpolated [1]. For the friction of a contact as a
         function of its slip, cubic interpolation is then accurate to 1e-4, and its derivative to 2e-3.
+    low_Hz : lower edge of the band in which the sensors correct the model; the correction rises from zero to full [Hz].
+        Below, inverting the sensor response would amplify sensor noise.
+    high_Hz : upper edge of that band; the correction falls from full to zero [Hz]. Above, the mounts deflect little.
+    least_excess : lower limit of the power attributed to a force, in standard deviations of the power of noise alone
+        [1]: next to none, but not zero. A limit of one or more would attribute noise to a force.
+    noise_from : fraction of the band above which only noise remains; its power is that of the sensors [1].
+    margin_s : length by which a record is extrapolated beyond its ends [s]: several periods of a table's lowest mode.
+    passes : iterations of this extrapolation.
+    relaxation : over-relaxation of these iterations [1]: a plain iteration reduces the error by only a fifth.
     """
 
     kept_bytes: int = 32_000_000
     node_ratio: float = 1.2
+    low_Hz: tuple[float, float] = (0.4, 0.8)
+    high_Hz: tuple[float, float] = (120.0, 150.0)
+    least_excess: float = 0.02
+    noise_from: float = 0.6
+    margin_s: float = 5.0
+    passes: int = 6
+    relaxation: float = 1.8
 
 
 SETTINGS = MotionSettings()

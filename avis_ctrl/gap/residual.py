@@ -153,17 +153,10 @@ def every_record(
     def ratio(e: PredictionError) -> float:
         return float(np.sqrt(e.chi2 / e.dof))
 
-    records = [
-        RecordGap(
-            name,
-            headers[name].level_V,
-            headers[name].start_s,
-            name in held,
-            ratio(a),
-            ratio(b),
-            f"{headers[name].excitation}, {b.block.kind}",
-        )
-        for name, a, b in ((a.block.name, a, b) for a, b in zip(first, last, strict=True))
-    ]
+    records = []
+    for a, b in zip(first, last, strict=True):
+        h, name = headers[a.block.name], a.block.name
+        kind = f"{h.excitation}, {b.block.kind}"
+        records.append(RecordGap(name, h.level_V, h.start_s, name in held, ratio(a), ratio(b), kind))
     shares = power_shares(last, headers, after, all_silent(prepared.halves.fitted, blocks), sensors_rms)
     return tuple(sorted(records, key=lambda one: one.name)), shares

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -53,7 +53,7 @@ class NamedEffect:
         return {
             "name": self.name,
             "location": self.location,
-            "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit} for key, p in self.parameters.items()},
+            "parameters": {key: asdict(p) for key, p in self.parameters.items()},
             "probability": self.probability,
             "indistinguishable_from": list(self.indistinguishable_from),
             **({} if self.share is None else {"share": self.share}),
@@ -143,6 +143,10 @@ class Where:
     share: float
     excess: float = float("nan")
     p_value: float = float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """As defined in the contract."""
+        return {key: getattr(self, key) for key in ("from_Hz", "to_Hz", "input", "output", "share")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,6 +281,7 @@ class Gap:
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""
+        places = [one.to_json() for one in self.remaining]
         return {
             "format": "avis-gap",
             "version": 1,
@@ -284,24 +289,9 @@ class Gap:
             "effects": [one.to_json() for one in self.effects],
             "traces": [one.to_json() for one in self.traces],
             "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": _places(self.remaining if self.verdict != "none" else ()),
-            "remaining": None
-            if self.left is None
-            else {
-                "nrmse": self.left.nrmse,
-                "over_noise": self.left.over_noise,
-                "share": self.left.share,
-                "where": _places(self.remaining),
-                "grows_with_level": self.left.grows_with_level,
-            },
+            "where": places if self.verdict != "none" else [],
+            "remaining": None if self.left is None else {**asdict(self.left), "where": places},
             "tolerances": [one.to_json() for one in self.tolerances],
             "next_experiment": self.next_experiment,
             "seconds": self.seconds,
         }
-
-
-def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
-    return [
-        {"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output, "share": one.share}
-        for one in places
-    ]

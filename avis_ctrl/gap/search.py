@@ -19,17 +19,15 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.parallel import Mapper, sequential_map
+from avis_ctrl.gap.parallel import Run
 from avis_ctrl.gap.probability import Step, name_of, probability_of
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.settings import SETTINGS, GapSettings
+from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import of_effect, of_values, rescaled, spread, tolerances_behind, within_tolerance
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +44,13 @@ class Candidate:
     others: tuple[ActiveEffect, ...] = ()
 
 
-def candidates(
-    fitted: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, each: Mapper = sequential_map
-) -> list[Candidate]:
+def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> list[Candidate]:
     """Every effect at every place with its best seed, the largest reduction first.
 
     Effects that add resonances with many parameters take long to initialise. They are searched only if one resonance
     with an arbitrary shape on every path gives a sufficient reduction.
     """
-    score = EvidenceScore(fitted, data, settings)
+    score = EvidenceScore(fitted, data, run.settings)
     model, taken = score.model, {name_of(label) for label in fitted.labels}
 
     def scored(effect: Effect) -> list[Candidate]:
@@ -66,16 +62,16 @@ def candidates(
                 best = seeds(effect, score, place)
                 starts = [
                     active(effect, model, place, values)
-                    for values in dict.fromkeys(one.values for one in best[: settings.starts])
+                    for values in dict.fromkeys(one.values for one in best[: run.settings.starts])
                 ]
                 found += [Candidate(starts[0], best[0].chi2, best[0].p_value, tuple(starts[1:]))] if best else []
         return found
 
     resonant = [one for one in effects if one.resonant]
-    found = [one for own in each(scored, [one for one in effects if not one.resonant]) for one in own]
+    found = [one for own in run.each(scored, [one for one in effects if not one.resonant]) for one in own]
     most = max((one.reduction for one in found), default=0.0)
-    if not found or resonance(score) >= settings.resonance_share * most:
-        found += [one for own in each(scored, resonant) for one in own]
+    if not found or resonance(score) >= run.settings.resonance_share * most:
+        found += [one for own in run.each(scored, resonant) for one in own]
     return sorted(found, key=lambda one: -one.reduction)
 
 
@@ -112,7 +108,12 @@ def extensions(fits: Sequence[Fitted], data: Data, settings: GapSettings) -> lis
 
 
 def _priors_of(one: ActiveEffect, model: TableModel, settings: GapSettings) -> Priors:
-    return _with_known(of_effect(one, tolerances_of(model.rig), settings), model.priors)
+    """Priors of an effect's parameters, with those that it specifies itself (`Effect.priors`)."""
+    priors, known = of_effect(one, tolerances_of(model.rig), settings), model.priors
+    mean, sigma = priors.mean.copy(), priors.sigma.copy()
+    for row, name in enumerate(priors.names):
+        mean[row], sigma[row] = known.get(name, (mean[row], sigma[row]))
+    return replace(priors, mean=mean, sigma=sigma)
 
 
 def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSettings) -> Fitted | None:
@@ -140,15 +141,6 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     return _try(fitted, model, priors, fitted.z[rows], data, settings)
 
 
-def _with_known(priors: Priors, known: Mapping[str, tuple[float, float]]) -> Priors:
-    """Priors with those that an effect specifies for parameters that records need not determine (`Effect.priors`)."""
-    rows = [priors.names.index(name) for name in known if name in priors.names]
-    mean, sigma = priors.mean.copy(), priors.sigma.copy()
-    for row in rows:
-        mean[row], sigma[row] = known[priors.names[row]]
-    return replace(priors, mean=mean, sigma=sigma)
-
-
 def _try(
     fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
 ) -> Fitted | None:
@@ -159,13 +151,7 @@ def _try(
 
 
 def search(
-    base: Fitted,
-    data: Data,
-    effects: Sequence[Effect],
-    settings: GapSettings = SETTINGS,
-    progress: Progress = lambda text: None,
-    each: Mapper = sequential_map,
-    enough: Callable[[Step], bool] = lambda step: False,
+    base: Fitted, data: Data, effects: Sequence[Effect], run: Run, enough: Callable[[Step], bool] = lambda step: False
 ) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
@@ -175,12 +161,13 @@ def search(
     The last step has the fit with all effects found.
     """
     steps: list[Step] = []
+    settings, progress = run.settings, run.progress
 
     def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
-            step = next_effect(now, data, effects, settings, progress, each)
+            step = next_effect(now, data, effects, run)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -201,29 +188,20 @@ def search(
     return steps
 
 
-def outliers(
-    now: Fitted,
-    data: Data,
-    effects: Sequence[Effect],
-    settings: GapSettings = SETTINGS,
-    progress: Progress = lambda text: None,
-    each: Mapper = sequential_map,
-) -> tuple[list[Step], Fitted]:
+def outliers(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> tuple[list[Step], Fitted]:
     """Values of the rig file beyond their tolerance that stand out because the other values moved by much less than
     their tolerances; and the last fit, with the tolerances as stated.
 
     The priors are as narrow as the spread of the values, both without and with each effect.
     """
+    settings = run.settings
     rows, size = spread(now, settings)
     if size > settings.narrow:
         return [], now
-    progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
+    run.progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
     narrow, beyond = _with_spread(now, rows, size, data, settings), of_values(effects, now.model)
-    while (
-        len(narrow.labels) < settings.longest
-        and (step := next_effect(narrow, data, beyond, settings, progress, each)) is not None
-    ):
+    while len(narrow.labels) < settings.longest and (step := next_effect(narrow, data, beyond, run)):
         steps.append(step)
         narrow = step.fitted
     return steps, _with_spread(narrow, rows, 1 / size, data, settings) if steps else now
@@ -303,15 +281,14 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
 
 
-def next_effect(
-    now: Fitted, data: Data, effects: Sequence[Effect], settings: GapSettings, progress: Progress, each: Mapper
-) -> Step | None:
+def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough."""
+    settings = run.settings
     begun = without_path_errors(now, data, settings)
-    found = candidates(begun, data, effects, settings, each)
+    found = candidates(begun, data, effects, run)
     short = shortlist(found, settings)
-    progress(f"  {len(found)} candidates by their first-order gain, of which {len(short)} are fitted")
-    tried = _tried(begun, short, data, settings, each)
+    run.progress(f"  {len(found)} candidates by their first-order gain, of which {len(short)} are fitted")
+    tried = _tried(begun, short, data, run)
     if not tried:
         return None
     better, best, asked = tried, _likeliest(tried), set(tried)
@@ -321,8 +298,8 @@ def next_effect(
         further = [*extensions(list(better.values()), data, settings), *other_laws(found, rivals, asked)]
         asked |= {one.effect.label for one in further}
         if further:
-            progress(f"  {len(further)} more forms of the best candidates are fitted")
-        more, before = _tried(begun, further, data, settings, each), tried
+            run.progress(f"  {len(further)} more forms of the best candidates are fitted")
+        more, before = _tried(begun, further, data, run), tried
         tried = _likelier([*before.values(), *more.values()])
         best = _likeliest(tried)
         better = {
@@ -347,13 +324,12 @@ class _Begun:
     reduction: float
 
 
-def _tried(
-    now: Fitted, chosen: Sequence[Candidate], data: Data, settings: GapSettings, each: Mapper
-) -> dict[str, Fitted]:
+def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, run: Run) -> dict[str, Fitted]:
     """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
     order; then, for candidates that are not far behind, all parameters."""
     if not chosen:
         return {}
+    settings = run.settings
     profile = Profile(now, data, settings)
 
     def fitted(one: ActiveEffect, iterations: int) -> _Begun | None:
@@ -375,7 +351,7 @@ def _tried(
             starts = [max(ends, key=lambda end: end.gain).effect] if ends else []
         return one, fitted(starts[0], settings.rough_iterations) if starts else None
 
-    made = each(begun, chosen)
+    made = run.each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
     near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
@@ -389,22 +365,22 @@ def _tried(
             and (end is None or end.reduction < settings.least_promised * one.reduction)
         )
     ]
-    return _likelier(_joint_fits(now, near, data, settings, each))
+    return _likelier(_joint_fits(now, near, data, run))
 
 
-def _joint_fits(
-    now: Fitted, effects: Sequence[ActiveEffect], data: Data, settings: GapSettings, each: Mapper
-) -> list[Fitted]:
+def _joint_fits(now: Fitted, effects: Sequence[ActiveEffect], data: Data, run: Run) -> list[Fitted]:
     """Fits of all parameters with one more effect each. Excluded are fits that fail, that end at values which physics
     forbids, or that end within a tolerance."""
 
     def ended(one: ActiveEffect) -> Fitted | None:
-        return _small(with_effect(now, one, data, settings.quick))
+        return _small(with_effect(now, one, data, run.settings.quick))
 
-    found = [_whole(one, now) for one in each(ended, effects) if one is not None]
+    found = [_whole(one, now) for one in run.each(ended, effects) if one is not None]
     stated = tolerances_of(now.model.rig)
     return [
-        one for one in found if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, settings)
+        one
+        for one in found
+        if not implausible(one) and not within_tolerance(one.model.effects[-1], stated, run.settings)
     ]
 
 
@@ -456,13 +432,9 @@ def at_the_edge(effect: ActiveEffect) -> str:
     """Describe a shape parameter that ended at its physical bound, where the effect has turned into a different one;
     empty if there is none."""
     for parameter, value in zip(effect.parameters, effect.values, strict=True):
-        span = parameter.high - parameter.low
-        if (
-            not parameter.linear
-            and not parameter.optional
-            and (value > parameter.high - 1e-6 * span or value < parameter.low + 1e-6 * span)
-        ):
-            return (
-                f"{parameter.name} of {effect.effect.name} runs to {value:.3g} {parameter.unit}, the end of its range"
-            )
+        margin = 1e-6 * (parameter.high - parameter.low)
+        inside = parameter.low + margin <= value <= parameter.high - margin
+        if not (inside or parameter.linear or parameter.optional):
+            end = f"runs to {value:.3g} {parameter.unit}, the end of its range"
+            return f"{parameter.name} of {effect.effect.name} {end}"
     return ""

@@ -98,35 +98,16 @@ def without_hum(campaign: Campaign, hum: HumFinding, residual: tuple[RecordResid
 
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects found in the signals, with the names of the contract."""
+    fault = {"resolution": "is coarser than the rig file says", "clipping": "clips below its nominal range"}
     rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
-        (
-            "sensor_quantisation",
-            one.channel,
-            f"the converter of {one.channel} is coarser than the rig file says"
-            if one.kind == "resolution"
-            else f"the converter of {one.channel} clips below its nominal range",
-            one,
-        )
+        ("sensor_quantisation", one.channel, f"the converter of {one.channel} {fault[one.kind]}", one)
         for one in faults.converter
     ]
-    if faults.hum is not None:
-        rows.append(
-            (
-                "mains_hum",
-                "geophones",
-                f"mains hum of {faults.hum.nominal_Hz:g} Hz and harmonics in {', '.join(faults.hum.channels)}",
-                faults.hum,
-            )
-        )
-    if faults.noise is not None and faults.noise.ground_motion is not None:
-        rows.append(
-            (
-                "ground_motion",
-                "floor",
-                "the floor moves more than the rig file says, unmeasured",
-                faults.noise.ground_motion,
-            )
-        )
+    if hum := faults.hum:
+        where = f"mains hum of {hum.nominal_Hz:g} Hz and harmonics in {', '.join(hum.channels)}"
+        rows.append(("mains_hum", "geophones", where, hum))
+    if faults.noise and (floor := faults.noise.ground_motion):
+        rows.append(("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured", floor))
     return [
         NamedEffect(
             name, place, title, one.parameters, min(one.confidence, settings.most_sure), confirmation=one.sentence

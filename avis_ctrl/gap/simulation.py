@@ -5,7 +5,7 @@ are computed from sample to sample (`time_stepping`) and then act on the same li
 the sample rate: above it only the inertia of a table matters.
 
 Limits: a record starts at rest, with nothing before it. Effects that change the volts depending on the motion use the
-motion without this change. Records of more than `RecordLineSettings.most_samples` samples are refused.
+motion without this change. Records of more than `SimulationSettings.most_samples` samples are refused.
 """
 
 from __future__ import annotations
@@ -17,27 +17,12 @@ import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.line_response import LineResponse, line_response
+from avis_ctrl.gap.line_response import SETTINGS, LineResponse, line_response
 from avis_ctrl.gap.motion_estimate import mount_rows, with_large_motion
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.time_stepping import ForceResponse, march
 from avis_ctrl.identification.response import N_Q
-
-
-@dataclass(frozen=True)
-class SimulationSettings:
-    """Settings of forces that act over a whole record.
-
-    defect : maximum residual of the equation of motion over the deflection, r.m.s. [1]: far below any sensor's noise.
-    most_passes : maximum number of passes over the record before the simulation counts as not converging.
-    """
-
-    defect: float = 1e-5
-    most_passes: int = 12
-
-
-SETTINGS = SimulationSettings()
 
 
 @dataclass(frozen=True, eq=False)

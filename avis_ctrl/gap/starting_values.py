@@ -35,12 +35,31 @@ class StartSettings:
         resonance.
     peak_dampings : the same at the peaks of the residual [1], whose frequency is known better.
     followed_places : number of places at which three frequencies are searched on a finer grid, the best first.
-    narrowest : minimum damping ratio for the frequency grid of a sprung mass [1]; a smaller one would need more
-        frequencies than a search can afford.
+    narrowest : minimum damping ratio for the frequency grid of a sprung mass, or of a chassis around a fit [1]; a
+        smaller one would need more frequencies than a search can afford.
     stiff_Hz : frequency of a sprung mass along an axis in which it shows no resonance [Hz]: above the band.
     mode_Hz : lowest and highest frequency of a mode of the payload [Hz], and number of frequencies searched.
     modes_apart : minimum logarithm of the ratio of two modes' frequencies [1]: some half widths.
     smallest_shape : minimum prior standard deviation of a mode shape where no channel shows it [1/sqrt(kg)].
+
+    Of a chassis, whose coordinates are x, y, z, rx, ry and rz:
+
+    chassis_own_Hz : lowest and highest resonance frequency [Hz] of a single coordinate, and number of frequencies
+        searched; below the lowest, the suspension modes dominate.
+    chassis_damping : damping ratio of that search [1]: large enough that the grid misses no resonance.
+    chassis_least_gain : reduction of chi-square with one more coordinate over that without it, below which that
+        coordinate counts as stiff [1].
+    chassis_stiff_Hz : frequency of a coordinate in which no resonance was found [Hz]: near the end of the band.
+    chassis_fixed_Hz : frequency of a coordinate that shall not move [Hz]: far above the band, within the parameter's
+        range.
+    chassis_mass_ratio : ratio of the masses of two coordinates, up to which both can belong to one chassis [1].
+    chassis_radius_m : smallest and largest radius of gyration [m] at which a fit starts.
+    chassis_heights_m : height of the mass over the table's centre, and of the springs over the mass [m], at which a fit
+        starts.
+    chassis_lines : lines of a record for the search around a fit: fewer than the fit's, because it gives only starting
+        values.
+    chassis_followed_groups : number of groups of coordinates whose new frequencies are fitted, the most promising
+        first.
     """
 
     places_m: tuple[tuple[float, float, int], ...] = ((-0.6, 0.6, 7), (-0.5, 0.5, 6), (-0.3, 0.4, 4))
@@ -63,6 +82,16 @@ class StartSettings:
     mode_Hz: tuple[float, float, int] = (7.0, 140.0, 22)
     modes_apart: float = 0.08
     smallest_shape: float = 1e-3
+    chassis_own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
+    chassis_damping: float = 0.06
+    chassis_least_gain: float = 1.05
+    chassis_stiff_Hz: float = 90.0
+    chassis_fixed_Hz: float = 250.0
+    chassis_mass_ratio: float = 3.0
+    chassis_radius_m: tuple[float, float] = (0.1, 3.0)
+    chassis_heights_m: tuple[float, float] = (-0.3, 0.0)
+    chassis_lines: int = 200
+    chassis_followed_groups: int = 2
 
 
 SETTINGS = StartSettings()

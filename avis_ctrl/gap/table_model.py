@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter
+from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Table
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.operators import Assembled, Operators
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse
-from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, SensorModel, kept_lines
+from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.structure import structural_null_space, structure_of
-from avis_ctrl.rigs.rig import Rig
 
 
 @dataclass(frozen=True)
@@ -83,59 +82,16 @@ def active(effect: Effect, model: TableModel, place: str, values: Sequence[float
 
 
 @dataclass(frozen=True, eq=False)
-class TableModel:
+class TableModel(Table):
     """`ResponseModel` with effects.
 
-    base : the rig and its free parameters. effects : added, all their parameters free.
-    motion : records in time by name, required by effects that depend on amplitude or time.
-    nominal : the rig as in its file, which sets the step sizes of a fit: a parameter that a wrong model has driven to
-        zero must be able to recover. None for the base itself.
-    corners_differ : no filter cancels a geophone's suspension exactly (`sensor_transients`).
-    held : labels of effects whose parameters are fixed.
+    effects : added, all their parameters free. corners_differ : no filter cancels a geophone's suspension exactly
+    (`sensor_transients`). held : labels of effects whose parameters are fixed.
     """
 
-    base: ResponseModel
     effects: tuple[ActiveEffect, ...] = ()
-    motion: Mapping[str, RecordMotion] = field(default_factory=dict)
-    nominal: ResponseModel | None = None
     corners_differ: bool = False
     held: frozenset[str] = frozenset()
-
-    # Interface used by a fit and its blocks.
-    @property
-    def rig(self) -> Rig:
-        """The rig of the base."""
-        return self.base.rig
-
-    @property
-    def sensors(self) -> SensorModel:
-        """Sensors of the base."""
-        return self.base.sensors
-
-    @property
-    def actuators(self) -> tuple[str, ...]:
-        """Names of the drives."""
-        return self.base.actuators
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the drives, and of the floor's axes."""
-        return self.base.inputs
-
-    @property
-    def period_s(self) -> float:
-        """Sample period [s]; 0 for responses to the voltage itself."""
-        return self.base.period_s
-
-    @property
-    def delay_s(self) -> float:
-        """Delay of the base [s]."""
-        return self.base.delay_s
-
-    @property
-    def amplifier_corner_Hz(self) -> float | None:
-        """Corner of the amplifiers of the base [Hz]; None without a lag."""
-        return self.base.amplifier_corner_Hz
 
     @cached_property
     def _free(self) -> list[tuple[int, int]]:

@@ -10,38 +10,18 @@ Hairer, Lubich and Schlichte, SIAM J. Sci. Stat. Comput. 6, 1985).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.fft
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.gap.effects.mounts import ContactFriction, Contacts, pushed
-from avis_ctrl.gap.line_response import LineResponse
+from avis_ctrl.gap.line_response import SETTINGS, LineResponse
 from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.response import N_Q
-
-
-@dataclass(frozen=True)
-class MarchSettings:
-    """Settings of the solution in windows of time.
-
-    window_s : length of a window [s]: about a radian of the fastest motion of a mount with friction at rest.
-    tolerance : a window has converged when its deflection changes by less than this fraction of the largest one so far
-        [1].
-    most_iterations : maximum fixed-point iterations in a window before it is divided into more pieces.
-    pieces : numbers of pieces of a window, tried in this order until the iteration contracts; 2^20 for single samples.
-    """
-
-    window_s: float = 0.05
-    tolerance: float = 1e-9
-    most_iterations: int = 40
-    pieces: tuple[int, ...] = (1, 8, 1 << 20)
-
-
-SETTINGS = MarchSettings()
 
 
 class ForceResponse:
@@ -187,7 +167,7 @@ def march(
                 deflection = moved[a:b] @ by_force.shape.T + beyond[here]
                 change = np.inf if before is None else float(np.max(np.abs(deflection - before)))
                 record.deflection[here] = before = deflection
-                if change <= SETTINGS.tolerance * largest:
+                if change <= SETTINGS.window_tolerance * largest:
                     break
                 if not change < np.inf and iteration > 1:
                     return None

@@ -25,15 +25,21 @@ from avis_ctrl.lti.norms import decibels, hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import Design, read_study
-from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
-from avis_ctrl.study.gap_plant import DESCRIBED_IN, delay_order, design_files, plant_of, six_dof_is_stable, wiring_of
+from avis_ctrl.study.gap_plant import (
+    DESCRIBED_IN,
+    DesignFiles,
+    delay_order,
+    design_files,
+    plant_of,
+    six_dof_is_stable,
+    wiring_of,
+)
 from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
-from avis_ctrl.study.identification_design import default_design, default_keep, design_toml
+from avis_ctrl.study.identification_design import default_design, default_keep
 from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
@@ -191,7 +197,7 @@ def compare_designs(
         except ComputationError as error:
             notes.append(f"No controller was found for the updated model: {error}")
     realised = realise(updated)
-    files, in_files, not_in_files = start_files(in_files_design, updated, when)
+    files = design_files(in_files_design, updated, when)
     left_out = not_realised(updated)
     not_checked = left_out | dict.fromkeys(signals, "it acts on the measured signals and is not part of the loop")
     held = "all" if not left_out else "none" if len(left_out) == len(updated.effects) else "some"
@@ -201,7 +207,7 @@ def compare_designs(
         *notes,
         *(uncertainty.sentences() if uncertainty else ()),
         *_other_ranges(in_files_design, uncertainty),
-        *_remarks(realised, design, new_rig, updated, when, in_files, not_in_files),
+        *_remarks(realised, design, new_rig, updated, when, files),
     )
     return DesignEffect(
         before,
@@ -210,9 +216,9 @@ def compare_designs(
         K,
         K_new,
         realised,
-        in_files,
-        not_in_files,
-        files,
+        files.inside,
+        files.outside,
+        files.texts(),
         words,
         time.monotonic() - began,
         not_checked,
@@ -277,23 +283,6 @@ def figures(design: Design, model: TableModel, plant: DesignPlant, K: StateSpace
         decibels(worst.upper),
         decibels(worst_band.upper),
         fastest,
-    )
-
-
-def start_files(
-    design: Design, model: TableModel, when: float = 0.0
-) -> tuple[dict[str, str], tuple[str, ...], tuple[str, ...]]:
-    """rig.toml and design.toml of a model by name, labels of the effects that they contain, and of the others."""
-    found = design_files(design, model, when)
-    held = ", ".join(found.inside) or "none"
-    header = f"{found.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"
-    if found.outside:
-        header += f"\neffects that no rig or design file holds: {', '.join(found.outside)}"
-    asked = found.design.model_copy(update={"rig": RIG_FILE})
-    return (
-        {RIG_FILE: rig_toml(found.rig, header=header), DESIGN_FILE: design_toml(asked)},
-        found.inside,
-        found.outside,
     )
 
 
@@ -377,13 +366,7 @@ def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[st
 
 
 def _remarks(
-    realised: Realised,
-    design: Design,
-    plant_rig: Rig,
-    model: TableModel,
-    when: float,
-    inside: Sequence[str],
-    outside: Sequence[str],
+    realised: Realised, design: Design, plant_rig: Rig, model: TableModel, when: float, files: DesignFiles
 ) -> list[str]:
     """Sentences on the accuracy of the figures and on where the effects are described."""
     if not model.effects:
@@ -406,13 +389,13 @@ def _remarks(
     if any(one.effect.name == "stiffness_drift" for one in model.effects):
         said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
     by_label = {one.label: one.effect.name for one in model.effects}
-    if inside:
-        places = {label: DESCRIBED_IN.get(by_label[label]) for label in inside}
+    if files.inside:
+        places = {label: DESCRIBED_IN.get(by_label[label]) for label in files.inside}
         where = [f"{label} ({place})" if place else label for label, place in places.items()]
         said.append(f"rig.toml and design.toml hold {', '.join(where)}: `avis design` runs on the updated model.")
-    if outside:
+    if files.outside:
         said.append(
-            f"No rig or design file holds {', '.join(outside)}: only the figures here have it in them, and "
+            f"No rig or design file holds {', '.join(files.outside)}: only the figures here have it in them, and "
             "`avis design` on these files does not."
         )
     return said

@@ -17,6 +17,7 @@ from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
+from avis_ctrl.gap.signals.repair import channel_limits
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -259,15 +260,10 @@ def converter_limits(
 
     effects : named effects and traces (very small effects), as in gap.json.
     """
-    n = len(campaign.y_names)
-    converter = model.rig.converter if campaign.y_unit == "V" else None
-    low, high = (np.full(n, one) for one in (converter.limits_V if converter else (-np.inf, np.inf)))
+    found = []
     for one in effects:
-        if one["name"] != "sensor_quantisation" or one.get("location") not in campaign.y_names:
-            continue
-        k = campaign.y_names.index(one["location"])
-        for key, array, narrower in (("clip_low_V", low, max), ("clip_high_V", high, min)):
-            found = one.get("parameters", {}).get(key, {}).get("value")
-            if isinstance(found, (int, float)):
-                array[k] = narrower(array[k], found)
-    return low, high
+        if one["name"] == "sensor_quantisation":
+            given = {key: of.get("value") for key, of in one.get("parameters", {}).items()}
+            values = {key: value for key, value in given.items() if isinstance(value, (int, float))}
+            found.append((one.get("location"), values))
+    return channel_limits(model.rig.converter if campaign.y_unit == "V" else None, campaign.y_names, found)

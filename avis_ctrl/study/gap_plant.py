@@ -25,9 +25,12 @@ from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.realisation import with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
+from avis_ctrl.study.identification_design import design_toml
 from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
@@ -68,6 +71,15 @@ class DesignFiles:
     design: Design
     inside: tuple[str, ...]
     outside: tuple[str, ...]
+
+    def texts(self) -> dict[str, str]:
+        """Contents of rig.toml and design.toml by name."""
+        held = ", ".join(self.inside) or "none"
+        header = f"{self.rig.name}, updated by avis gap\neffects in this folder's rig.toml and design.toml: {held}"
+        if self.outside:
+            header += f"\neffects that no rig or design file holds: {', '.join(self.outside)}"
+        design = self.design.model_copy(update={"rig": RIG_FILE})
+        return {RIG_FILE: rig_toml(self.rig, header=header), DESIGN_FILE: design_toml(design)}
 
 
 def wiring_of(plant: DesignPlant, model: TableModel) -> Wiring:

@@ -37,6 +37,7 @@ NO_TUNING = {
     "MAINS_HZ",
     "MOUNT",
     "PROBLEMS",
+    "PARTS",
     "PRODUCTS",
     "RAYLEIGH",
     "RELEASED",

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed.library import unnamed_faults
+from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.motion_estimate import mount_rows
+from avis_ctrl.gap.parallel import Run
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import search
@@ -141,7 +142,7 @@ def searched(truth, *names):
     data = Data((block(truth, "00"), block(truth, "01")), (0.1, 0.5))
     settings = GapSettings()
     base = fit(MODEL, re_identified(RIG), np.zeros(len(MODEL.names)), data, first_variances(data, settings), settings)
-    return search(base, data, [*(library()[name] for name in names), *unnamed_faults().values()])
+    return search(base, data, [*(library()[name] for name in names), *unnamed_faults().values()], Run())
 
 
 @pytest.mark.slow

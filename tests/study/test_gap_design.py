@@ -21,14 +21,7 @@ from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import read_study
-from avis_ctrl.study.gap_design import (
-    PARAMETERS_PERCENT,
-    LoopFigures,
-    compare_designs,
-    design_effect,
-    figures,
-    start_files,
-)
+from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, LoopFigures, compare_designs, design_effect, figures
 from avis_ctrl.study.gap_plant import design_files, plant_of, six_dof_is_stable, wiring_of
 from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.study.plant import build_plant
@@ -187,9 +180,9 @@ def moved(plant, size: float) -> np.ndarray:
 def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, values, seen):
     """The plant that `avis design` makes of rig.toml and design.toml is the updated one."""
     model = with_one(baseline, name, place, values)
-    files, inside, outside = start_files(design, model, 0.0)
-    assert inside == (f"{name}@{place}",) and outside == ()
-    for file, text in files.items():
+    files = design_files(design, model)
+    assert files.inside == (f"{name}@{place}",) and files.outside == ()
+    for file, text in files.texts().items():
         (tmp_path / file).write_text(text, encoding="utf-8")
     plant, updated = build_plant(*read_study(tmp_path / "design.toml")), plant_of(design, model)[0]
     assert same(moved(plant, 0.0), moved(updated, 0.0))

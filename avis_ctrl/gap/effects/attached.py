@@ -41,59 +41,22 @@ class AttachedOscillator(AtPoint):
     resonant = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        mass = model.rig.mounted_body().mass
-        frequency = EffectParameter(
-            "frequency_Hz",
-            "Hz",
-            "of the mass on its spring",
-            0.0,
-            0.3,
-            300.0,
-            10.0,
-            False,
-            tuple(np.geomspace(*SETTINGS.attached_Hz)),
-        )
-        damping = EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 2.0, 0.05, False, (0.05,), True)
+        mass, shape, grid = model.rig.mounted_body().mass, EffectParameter.shape, np.geomspace(*SETTINGS.attached_Hz)
+        frequency = shape("frequency_Hz", "Hz", "of the mass on its spring", 0.3, 300.0, 10.0, grid)
+        damping = shape("damping", "1", "damping ratio", 1e-3, 2.0, 0.05, (0.05,), optional=True)
         own = EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass)
         variant = place.partition("/")[2]
         if variant == "oblique":
-            most = float(np.sqrt(mass))
-            root = [
-                EffectParameter(
-                    f"along_{axis}",
-                    "sqrt(kg)",
-                    f"root of the mass times its direction's {axis}",
-                    0.0,
-                    -most,
-                    most,
-                    0.1 * most,
-                )
-                for axis in "xyz"
-            ]
+            most, words = float(np.sqrt(mass)), "root of the mass times its direction's {}"
+            root = EffectParameter("along_{}", "sqrt(kg)", words, 0.0, -most, most, 0.1 * most).of_each("xyz")
             # The position along the line of action has no effect, so it may end at a bound.
             return (*root, frequency, damping, *(replace(one, optional=True) for one in self.position()))
         if variant in THREE_AXES:
-            each = [
-                replace(frequency, name=f"frequency_{axis}_Hz", description=f"of the mass along {axis}")
-                for axis in "xyz"
-            ]
-            turns = [
-                EffectParameter(
-                    f"turn_{axis}",
-                    "rad",
-                    f"{axis} component of the rotation vector of its axes",
-                    0.0,
-                    -LIBRARY.most_turned,
-                    LIBRARY.most_turned,
-                    0.3,
-                    False,
-                    (0.0,),
-                    True,
-                )
-                for axis in "xyz"
-                if variant == "turned"
-            ]
-            return (own, *each, damping, *self.position(), *turns)
+            each = replace(frequency, name="frequency_{}_Hz", description="of the mass along {}").of_each("xyz")
+            most, words = LIBRARY.most_turned, "{} component of the rotation vector of its axes"
+            turns = shape("turn_{}", "rad", words, -most, most, 0.3, (0.0,), optional=True)
+            turned = turns.of_each("xyz") if variant == "turned" else ()
+            return (own, *each, damping, *self.position(), *turned)
         across = [one for one in self.position() if len(variant) > 1 or one.name != f"{variant}_m"]
         return (own, frequency, damping, *across)
 
@@ -130,9 +93,8 @@ class AttachedOscillator(AtPoint):
         frequencies = (*np.geomspace(grid[0], grid[-1], count), SETTINGS.stiff_Hz)
         others = [k for k in range(3) if k != first]
         points = place_of(values) + np.outer(np.linspace(-LIBRARY.reach_m, LIBRARY.reach_m, 25), a / np.sqrt(mass))
-        pair, point = _along_the_others(
-            score, values["damping"], frequencies, points, "".join("xyz"[k] for k in others)
-        )
+        axes = "".join("xyz"[k] for k in others)
+        pair, point = _along_the_others(score, values["damping"], frequencies, points, axes)
         frequency = np.full(3, values["frequency_Hz"])
         frequency[others] = pair
         return [("payload/axes", tuple(map(float, (mass, *frequency, values["damping"], *point))))]
@@ -149,12 +111,8 @@ class AttachedOscillator(AtPoint):
         if not np.any(along(values)):
             return found
         line = reported_line(values, covariance, "mass_kg", "kg")
-        return {
-            "mass_kg": line.pop("mass_kg"),
-            "frequency_Hz": found["frequency_Hz"],
-            "damping": found["damping"],
-            **line,
-        }
+        own = {name: found[name] for name in ("frequency_Hz", "damping")}
+        return {"mass_kg": line.pop("mass_kg"), **own, **line}
 
 
 def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]]:
@@ -167,14 +125,8 @@ def elements(place: str, values: Values) -> list[tuple[np.ndarray, float, float]
     if variant == "turned":
         rows = Rotation.from_rotvec([values[f"turn_{axis}"] for axis in "xyz"]).as_matrix().T @ rows
     axes = "xyz" if variant in THREE_AXES else variant
-    return [
-        (
-            rows["xyz".index(axis)],
-            values["mass_kg"],
-            values[f"frequency_{axis}_Hz" if variant in THREE_AXES else "frequency_Hz"],
-        )
-        for axis in axes
-    ]
+    name = "frequency_{}_Hz" if variant in THREE_AXES else "frequency_Hz"
+    return [(rows["xyz".index(axis)], values["mass_kg"], values[name.format(axis)]) for axis in axes]
 
 
 def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:

@@ -16,10 +16,10 @@ shape the effect (a frequency, a damping).
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,40 +62,58 @@ SETTINGS = LibrarySettings()
 Values = Mapping[str, float]
 
 
-class Table(Protocol):
-    """What an effect uses of the table that it acts on: the model without the effect (`gap.table_model.TableModel`).
+@dataclass(frozen=True, eq=False)
+class Table:
+    """What an effect uses of the table that it acts on: the model without the effect.
 
-    base : the rig and its free parameters. nominal : the same as in the rig file, None for the base itself.
-    effective : the base with the rig parameters as other effects set them.
-    motion : records in time, by name.
+    base : the rig and its free parameters. motion : records in time by name, required by effects that depend on
+    amplitude or time. nominal : the rig as in its file, which sets the step sizes of a fit: a parameter that a wrong
+    model has driven to zero must be able to recover. None for the base itself.
     """
 
-    @property
-    def base(self) -> ResponseModel: ...
+    base: ResponseModel
+    motion: Mapping[str, RecordMotion] = field(default_factory=dict)
+    nominal: ResponseModel | None = None
 
     @property
-    def nominal(self) -> ResponseModel | None: ...
+    def effective(self) -> ResponseModel:
+        """The base with the rig parameters that other effects set."""
+        return self.base
 
     @property
-    def effective(self) -> ResponseModel: ...
+    def rig(self) -> Rig:
+        """The rig of the base."""
+        return self.base.rig
 
     @property
-    def motion(self) -> Mapping[str, RecordMotion]: ...
+    def sensors(self) -> SensorModel:
+        """Sensors of the base."""
+        return self.base.sensors
 
     @property
-    def rig(self) -> Rig: ...
+    def actuators(self) -> tuple[str, ...]:
+        """Names of the drives."""
+        return self.base.actuators
 
     @property
-    def sensors(self) -> SensorModel: ...
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the drives, and of the floor's axes."""
+        return self.base.inputs
 
     @property
-    def actuators(self) -> tuple[str, ...]: ...
+    def period_s(self) -> float:
+        """Sample period [s]; 0 for responses to the voltage itself."""
+        return self.base.period_s
 
     @property
-    def delay_s(self) -> float: ...
+    def delay_s(self) -> float:
+        """Delay of the base [s]."""
+        return self.base.delay_s
 
     @property
-    def amplifier_corner_Hz(self) -> float | None: ...
+    def amplifier_corner_Hz(self) -> float | None:
+        """Corner of the amplifiers of the base [Hz]; None without a lag."""
+        return self.base.amplifier_corner_Hz
 
 
 @dataclass(frozen=True)
@@ -117,6 +135,28 @@ class EffectParameter:
     linear: bool = True
     grid: tuple[float, ...] = ()
     optional: bool = False
+
+    @staticmethod
+    def shape(
+        name: str,
+        unit: str,
+        description: str,
+        low: float,
+        high: float,
+        size: float,
+        grid: Iterable[float],
+        *,
+        optional: bool = False,
+        none: float = 0.0,
+    ) -> EffectParameter:
+        """A parameter that is not linear: it shapes the effect."""
+        return EffectParameter(name, unit, description, none, low, high, size, False, tuple(map(float, grid)), optional)
+
+    def of_each(self, names: Iterable[int | str]) -> tuple[EffectParameter, ...]:
+        """The same parameter for each name, which replaces {} in name and description."""
+        return tuple(
+            replace(self, name=self.name.format(one), description=self.description.format(one)) for one in names
+        )
 
 
 @dataclass(frozen=True)
@@ -144,12 +184,9 @@ class Added(NamedTuple):
     output: np.ndarray | None = None
 
 
-def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> Iterator[EffectParameter]:
+def uneven(names: Iterable[int | str], words: str, most: float = 0.9) -> tuple[EffectParameter, ...]:
     """Parameters of mounts, contacts or drives that differ from their mean; words has {} for the name."""
-    return (
-        EffectParameter(f"uneven_{one}", "1", words.format(one), 0.0, -most, most, 0.1, False, (0.0,), True)
-        for one in names
-    )
+    return EffectParameter.shape("uneven_{}", "1", words, -most, most, 0.1, (0.0,), optional=True).of_each(names)
 
 
 def shares(values: Values) -> np.ndarray:

@@ -31,27 +31,13 @@ class CableStiffness(AtPoint):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         size = 0.02 * float(np.mean(np.diag(model.base.matrices.K)[:3])) / 4  # 2 % of one mount of four, on any rig
         most = 200 * size
+        own = EffectParameter("k_{}_N_per_m", "N/m", "stiffness along {}", 0.0, 0.0, most, size)
         if place.endswith("oblique"):
-            own = [
-                EffectParameter(
-                    f"along_{axis}",
-                    "sqrt(N/m)",
-                    f"root of the stiffness times its direction's {axis}",
-                    0.0,
-                    -float(np.sqrt(most)),
-                    float(np.sqrt(most)),
-                    float(np.sqrt(size)),
-                )
-                for axis in "xyz"
-            ]
-        else:
-            own = [
-                EffectParameter(f"k_{axis}_N_per_m", "N/m", f"stiffness along {axis}", 0.0, 0.0, most, size)
-                for axis in "xyz"
-            ]
+            words, high = "root of the stiffness times its direction's {}", float(np.sqrt(most))
+            own = EffectParameter("along_{}", "sqrt(N/m)", words, 0.0, -high, high, float(np.sqrt(size)))
         return (
-            *own,
-            EffectParameter("damping_s", "s", "damping over stiffness", 0.0, 0.0, 0.1, 1e-3, False, (0.0,), True),
+            *own.of_each("xyz"),
+            EffectParameter.shape("damping_s", "s", "damping over stiffness", 0.0, 0.1, 1e-3, (0.0,), optional=True),
             *(replace(one, optional=True) for one in self.position()),
         )
 

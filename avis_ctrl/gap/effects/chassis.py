@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 from operator import itemgetter
@@ -16,7 +16,7 @@ from avis_ctrl.gap.effects.mounts import OfMounts
 from avis_ctrl.gap.effects.sensors import receptance
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.gap.score import Reduction, Score, reduction
-from avis_ctrl.gap.starting_values import Seed
+from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.rigs.rigid_body import point_map
@@ -26,44 +26,6 @@ COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
 TOGETHER = (("x", "ry"), ("y", "rx"), *((coordinate,) for coordinate in COORDINATES))
 # Entries of the inverse mass matrix in these coordinates.
 ENTRIES = (*DIAGONAL, *(tuple(map(COORDINATES.index, group)) for group in TOGETHER[:2]))
-
-
-@dataclass(frozen=True)
-class ChassisSettings:
-    """Settings of the search for the starting values of a chassis.
-
-    A coordinate is one of x, y, z, rx, ry, rz of the chassis.
-
-    own_Hz : lowest and highest resonance frequency [Hz] of a single coordinate, and number of frequencies searched;
-        below the lowest, the suspension modes dominate.
-    damping : damping ratio of that search [1]: large enough that the grid misses no resonance.
-    least_gain : reduction of chi-square with one more coordinate over that without it, below which that coordinate
-        counts as stiff [1].
-    stiff_Hz : frequency of a coordinate in which no resonance was found [Hz]: near the end of the band.
-    fixed_Hz : frequency of a coordinate that shall not move [Hz]: far above the band, within the parameter's range.
-    mass_ratio : ratio of the masses of two coordinates, up to which both can belong to one chassis [1].
-    radius_m : smallest and largest radius of gyration [m] at which a fit starts.
-    heights_m : height of the mass over the table's centre, and of the springs over the mass [m], at which a fit starts.
-    lines : lines of a record for the search around a fit: fewer than the fit's, because it gives only starting values.
-    narrowest : minimum damping ratio of the resonances searched around a fit [1]; a smaller one would need more
-        frequencies, which are twice the half width apart.
-    followed_groups : number of groups of coordinates whose new frequencies are fitted, the most promising first.
-    """
-
-    own_Hz: tuple[float, float, int] = (7.0, 90.0, 26)
-    damping: float = 0.06
-    least_gain: float = 1.05
-    stiff_Hz: float = 90.0
-    fixed_Hz: float = 250.0
-    mass_ratio: float = 3.0
-    radius_m: tuple[float, float] = (0.1, 3.0)
-    heights_m: tuple[float, float] = (-0.3, 0.0)
-    lines: int = 200
-    narrowest: float = 0.02
-    followed_groups: int = 2
-
-
-SETTINGS = ChassisSettings()
 
 
 @register
@@ -82,63 +44,21 @@ class BaseCompliance(OfMounts):
     resonant = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        m = model.rig.mounted_body().mass
-
-        def frequency(coordinate: str) -> EffectParameter:
-            about = f"along {coordinate}" if len(coordinate) == 1 else f"about {coordinate[1]}"
-            return EffectParameter(
-                f"{coordinate}_Hz",
-                "Hz",
-                f"of the chassis on its base, {about}",
-                0.0,
-                1.0,
-                300.0,
-                10.0,
-                False,
-                (20.0,),
-                True,
-            )
-
+        m, shape = model.rig.mounted_body().mass, partial(EffectParameter.shape, optional=True)
+        along = shape("{}_Hz", "Hz", "of the chassis on its base, along {}", 1.0, 300.0, 10.0, (20.0,))
         found = (
-            EffectParameter("mass_kg", "kg", "of the chassis", 0.0, 0.05 * m, 400 * m, m, False, (2 * m,)),
-            EffectParameter("damping", "1", "damping ratio", 0.0, 1e-3, 1.0, 0.05, False, (0.06,), True),
-            *(frequency(coordinate) for coordinate in COORDINATES[:3]),
+            EffectParameter.shape("mass_kg", "kg", "of the chassis", 0.05 * m, 400 * m, m, (2 * m,)),
+            shape("damping", "1", "damping ratio", 1e-3, 1.0, 0.05, (0.06,)),
+            *along.of_each("xyz"),
         )
         if place.endswith("translation"):
             return found
         return (
             *found,
-            *(frequency(coordinate) for coordinate in COORDINATES[3:]),
-            *(
-                EffectParameter(
-                    f"gyration_{axis}_m",
-                    "m",
-                    f"radius of gyration about {axis}",
-                    0.0,
-                    0.03,
-                    5.0,
-                    0.3,
-                    False,
-                    (0.5,),
-                    True,
-                )
-                for axis in "xyz"
-            ),
-            EffectParameter(
-                "centre_z_m",
-                "m",
-                "height of its mass over the table's centre",
-                0.0,
-                -3.0,
-                1.0,
-                0.3,
-                False,
-                (-0.5,),
-                True,
-            ),
-            EffectParameter(
-                "base_z_m", "m", "height of its springs over its mass", 0.0, -2.0, 2.0, 0.3, False, (0.0,), True
-            ),
+            *replace(along, name="r{}_Hz", description="of the chassis on its base, about {}").of_each("xyz"),
+            *shape("gyration_{}_m", "m", "radius of gyration about {}", 0.03, 5.0, 0.3, (0.5,)).of_each("xyz"),
+            shape("centre_z_m", "m", "height of its mass over the table's centre", -3.0, 1.0, 0.3, (-0.5,)),
+            shape("base_z_m", "m", "height of its springs over its mass", -2.0, 2.0, 0.3, (0.0,)),
         )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
@@ -151,7 +71,7 @@ class BaseCompliance(OfMounts):
         leader = inverse[moving[0]] if moving else 0.0
         if leader <= 0:
             return []
-        ratio = SETTINGS.mass_ratio
+        ratio = SETTINGS.chassis_mass_ratio
         best = {
             coordinate: f
             for coordinate, f in best.items()
@@ -159,12 +79,12 @@ class BaseCompliance(OfMounts):
         }
         mass = self.parameters(score.model, place)[0]
         m = float(np.clip(1 / leader, 2 * mass.low, mass.high / 2))
-        at = [best.get(coordinate, SETTINGS.stiff_Hz) for coordinate in coordinates]
-        values = [m, SETTINGS.damping, *at[:3]]
+        at = [best.get(coordinate, SETTINGS.chassis_stiff_Hz) for coordinate in coordinates]
+        values = [m, SETTINGS.chassis_damping, *at[:3]]
         if len(coordinates) > 3:
             radii = [_radius(m, inverse.get(coordinate, 0.0)) for coordinate in coordinates[3:]]
-            values += [*at[3:], *radii, *SETTINGS.heights_m]
-        return [Seed(tuple(float(v) for v in values), took.chi2, len(best), SETTINGS.own_Hz[2] ** len(best))]
+            values += [*at[3:], *radii, *SETTINGS.chassis_heights_m]
+        return [Seed(tuple(float(v) for v in values), took.chi2, len(best), SETTINGS.chassis_own_Hz[2] ** len(best))]
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """The same law with other frequencies of one coordinate, or of two coupled ones. A fit can end with a wrong
@@ -173,24 +93,26 @@ class BaseCompliance(OfMounts):
         To first order, the recoil in these coordinates is replaced by that of other resonances. The suspension modes,
         which are sharp, stay where they are, since the data fix the compliance of the base.
         """
-        blocks = [thinned(part.block, SETTINGS.lines, seed=2) for part in score.parts]
+        blocks = [thinned(part.block, SETTINGS.chassis_lines, seed=2) for part in score.parts]
         model = score.model.without(one.label).with_effect(one)
         around, place = Score(replace(model, held=model.held | {one.label}), blocks), one.place
         damping = max(one.by_name["damping"], SETTINGS.narrowest)
-        low, high, _ = SETTINGS.own_Hz
+        low, high, _ = SETTINGS.chassis_own_Hz
         grid = np.geomspace(low, high, int(np.log(high / low) / (2 * damping)) + 2)
         A = np.array([recoils(around, partial(receptance, frequency_Hz=f, damping=damping), ENTRIES) for f in grid])
         found = []
         for group in TOGETHER:
             if not set(group) <= set(_coordinates(place)):
                 continue
-            fixed = one.by_name | {f"{coordinate}_Hz": SETTINGS.fixed_Hz for coordinate in group}
+            fixed = one.by_name | {f"{coordinate}_Hz": SETTINGS.chassis_fixed_Hz for coordinate in group}
             rest = around.e + recoil_of(around, partial(_difference, one.by_name, fixed))
             own = set(map(COORDINATES.index, group))
             columns = [k for k, entry in enumerate(ENTRIES) if set(entry) <= own]
             if best := _other_resonances(A[:, columns], rest, group, grid, one):
                 found.append(best)
-        return [(place, values) for chi2, values in sorted(found)[: SETTINGS.followed_groups] if chi2 < around.chi2]
+        return [
+            (place, values) for chi2, values in sorted(found)[: SETTINGS.chassis_followed_groups] if chi2 < around.chi2
+        ]
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.recoil, ops.follow = _recoil(values, ops.s)
@@ -279,7 +201,7 @@ def _body_of(group: Sequence[str], entries: np.ndarray, f: np.ndarray, now: Valu
     # A force along x at the height z turns about y with z, one along y about x with -z.
     sign = 1.0 if group[0] == "x" else -1.0
     mass, centre, springs = M[0, 0], sign * M[0, 1] / M[0, 0], sign * K[0, 1] / K[0, 0]
-    if not 1 / SETTINGS.mass_ratio < mass / now["mass_kg"] < SETTINGS.mass_ratio:
+    if not 1 / SETTINGS.chassis_mass_ratio < mass / now["mass_kg"] < SETTINGS.chassis_mass_ratio:
         return {}
     inertia, rotation = M[1, 1] - mass * centre**2, K[1, 1] - K[0, 0] * springs**2
     return {
@@ -300,7 +222,7 @@ def _within(one: ActiveEffect, values: Values) -> tuple[float, ...]:
 
 def _radius(mass: float, inverse_inertia: float) -> float:
     """Radius of gyration [m] of a mass [kg] by the inverse of its moment of inertia [1/(kg m^2)]."""
-    low, high = SETTINGS.radius_m
+    low, high = SETTINGS.chassis_radius_m
     return float(np.clip(1 / np.sqrt(inverse_inertia * mass), low, high)) if inverse_inertia > 0 else high
 
 
@@ -308,10 +230,10 @@ def _resonances(score: Score, coordinates: Sequence[str]) -> tuple[dict[str, flo
     """Frequencies [Hz] of the coordinates in which the chassis recoils, the most significant first, with the reduction
     of the sum of squares; its coefficients are the inverse masses [1/kg] and moments of inertia [1/(kg m^2)]."""
     rows, labels = [], []
-    for f in np.geomspace(*SETTINGS.own_Hz):
+    for f in np.geomspace(*SETTINGS.chassis_own_Hz):
         key = ("recoil", float(f))
         if key not in score.kept:
-            score.kept[key] = recoils(score, partial(receptance, frequency_Hz=f, damping=SETTINGS.damping))
+            score.kept[key] = recoils(score, partial(receptance, frequency_Hz=f, damping=SETTINGS.chassis_damping))
         rows += [score.kept[key][COORDINATES.index(coordinate)] for coordinate in coordinates]
         labels += [(coordinate, float(f)) for coordinate in coordinates]
     A = np.array(rows)
@@ -337,7 +259,7 @@ def _greedy(
                 if np.all(one.coefficients > 0):
                     trials.append((one.chi2, k, one))
         chi2, k, more = max(trials, key=itemgetter(0), default=(0.0, 0, took))
-        if not trials or chi2 < SETTINGS.least_gain * took.chi2:
+        if not trials or chi2 < SETTINGS.chassis_least_gain * took.chi2:
             return best, took
         took = more
         rows.append(k)

@@ -55,9 +55,10 @@ class ActuatorLag(Effect):
             ops.drive = ops.drive * (1 + ops.s[:, None] * tau) / (1 + ops.s[:, None] * each)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        tau = values["time_constant_s"] + model.base.amplifier_time_constant_s
-        std = float(np.sqrt(max(covariance[0, 0], 0.0)))
-        found = super().reported(model, place, values, covariance) | {"time_constant_s": Reported(tau, std, "s")}
+        found = super().reported(model, place, values, covariance)
+        own = found["time_constant_s"]
+        tau, std = own.value + model.base.amplifier_time_constant_s, own.std
+        found["time_constant_s"] = Reported(tau, std, "s")
         if tau <= 1e-9:  # at its bound there is no corner
             return found
         return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau**2), "Hz"), **found}
@@ -84,8 +85,9 @@ class LoopDelay(Effect):
         ops.delay_s = ops.delay_s + values["extra_delay_s"]
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        extra, std = values["extra_delay_s"], float(np.sqrt(max(covariance[0, 0], 0.0)))
-        return {"extra_delay_s": Reported(extra, std, "s"), "delay_s": Reported(model.delay_s + extra, std, "s")}
+        found = super().reported(model, place, values, covariance)
+        extra = found["extra_delay_s"]
+        return {**found, "delay_s": Reported(model.delay_s + extra.value, extra.std, "s")}
 
 
 @register
@@ -100,19 +102,10 @@ class ActuatorSaturation(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         peaks = [float(np.max(np.abs(one.volts))) for one in model.motion.values()] or [model.rig.drive_limit_V]
-        peak = min(max(peaks), model.rig.drive_limit_V) or model.rig.drive_limit_V
-        grid = tuple(peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2))
-        limit = EffectParameter(
-            "limit_V",
-            "V",
-            "voltage at which the drives clip",
-            model.rig.drive_limit_V,
-            peak / 50,
-            peak,
-            peak,
-            False,
-            grid,
-        )
+        known = model.rig.drive_limit_V
+        peak, words = min(max(peaks), known) or known, "voltage at which the drives clip"
+        grid = [peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2)]
+        limit = EffectParameter.shape("limit_V", "V", words, peak / 50, peak, peak, grid, none=known)
         own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
         return (limit, *own)
 

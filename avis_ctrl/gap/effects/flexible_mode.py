@@ -43,34 +43,16 @@ class PayloadFlexibleMode(Effect):
         for k in range(COUNTS[place.partition("/")[2]]):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [
-                EffectParameter(
-                    f"frequency{of}_Hz",
-                    "Hz",
-                    f"{of_mode}, free",
-                    0.0,
-                    3.0,
-                    400.0,
-                    20.0,
-                    False,
-                    tuple(np.geomspace(*SETTINGS.mode_Hz).tolist()),
+                EffectParameter.shape(
+                    f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 3.0, 400.0, 20.0, np.geomspace(*SETTINGS.mode_Hz)
                 ),
-                EffectParameter(
-                    f"damping{of}", "1", f"damping ratio {of_mode}", 0.0, 1e-4, 0.5, 0.02, False, (0.02,), True
-                ),
-                *(
-                    EffectParameter(
-                        f"shape{of}_{name.replace('.', '_')}",
-                        "1/sqrt(kg)",
-                        f"mass-normalised shape {of_mode} at {name}",
-                        0.0,
-                        -1.0,
-                        1.0,
-                        0.01,
-                        optional=not own,
-                    )
-                    for name, own in zip(names, driven, strict=True)
+                EffectParameter.shape(
+                    f"damping{of}", "1", f"damping ratio {of_mode}", 1e-4, 0.5, 0.02, (0.02,), optional=True
                 ),
             ]
+            for name, own in zip(names, driven, strict=True):
+                words, short = f"mass-normalised shape {of_mode} at {name}", f"shape{of}_{name.replace('.', '_')}"
+                found.append(EffectParameter(short, "1/sqrt(kg)", words, 0.0, -1.0, 1.0, 0.01, optional=not own))
         return tuple(found)
 
     def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
@@ -92,11 +74,8 @@ class PayloadFlexibleMode(Effect):
         at_actuators, at_sensors = shape_rows(ops.base.rig, ops.base.actuators, ops.base.sensors.names)
         for frequency, zeta, shape in modes(values):
             if np.any(shape):
-                ops.added.append(
-                    AddedCoordinate(
-                        second_order(ops.s, frequency, zeta), shape, at_actuators @ shape, at_sensors @ shape
-                    )
-                )
+                stiffness = second_order(ops.s, frequency, zeta)
+                ops.added.append(AddedCoordinate(stiffness, shape, at_actuators @ shape, at_sensors @ shape))
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
         """Residues over all paths at the frequencies that reduce chi-square most; the shape is their symmetric part of

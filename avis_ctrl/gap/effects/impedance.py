@@ -49,15 +49,11 @@ def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarra
 @lru_cache(maxsize=16)
 def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
     found = []
+    pairs = [("xyz".index(a),) * 2 for a in axes] + ([(0, 1), (0, 2), (1, 2)] if oblique else [])
     for point in np.frombuffer(points).reshape(-1, 3):
         G = point_map(point)
-        pairs = [("xyz".index(a),) * 2 for a in axes] + ([(0, 1), (0, 2), (1, 2)] if oblique else [])
-        found.append(
-            [
-                symmetric_coordinates(np.outer(G[i], G[j]) if i == j else np.outer(G[i], G[j]) + np.outer(G[j], G[i]))
-                for i, j in pairs
-            ]
-        )
+        springs = (np.outer(G[i], G[j]) + (i != j) * np.outer(G[j], G[i]) for i, j in pairs)
+        found.append([symmetric_coordinates(one) for one in springs])
     return np.array(found)
 
 

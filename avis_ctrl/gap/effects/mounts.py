@@ -48,19 +48,10 @@ class MountRelaxation(OfMounts):
     holds_states = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
+        corners = (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0)
         return (
             EffectParameter("stiffness_ratio", "1", "stiffness of the branch over that at rest", 0.0, 0.0, 20.0, 0.1),
-            EffectParameter(
-                "corner_Hz",
-                "Hz",
-                "above which the branch acts",
-                0.0,
-                0.02,
-                300.0,
-                1.0,
-                False,
-                (0.3, 0.8, 1.5, 2.5, 4.0, 7.0, 15.0, 40.0),
-            ),
+            EffectParameter.shape("corner_Hz", "Hz", "above which the branch acts", 0.02, 300.0, 1.0, corners),
         )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
@@ -111,34 +102,12 @@ class MountSurge(OfMounts):
     resonant = True
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        count = int(np.sum(vertical(model.rig)))
+        count, shape = int(np.sum(vertical(model.rig))), EffectParameter.shape
+        grid, share = np.geomspace(*SETTINGS.surge_Hz), "of the mount's compliance between mass and payload"
         return (
-            EffectParameter(
-                "frequency_Hz",
-                "Hz",
-                "of the mass inside the mounts",
-                np.inf,
-                4.0,
-                400.0,
-                20.0,
-                False,
-                tuple(np.geomspace(*SETTINGS.surge_Hz).tolist()),
-            ),
-            EffectParameter(
-                "payload_share",
-                "1",
-                "of the mount's compliance between mass and payload",
-                0.5,
-                0.05,
-                0.95,
-                0.2,
-                False,
-                (0.5,),
-                True,
-            ),
-            EffectParameter(
-                "damping_ratio", "1", "of that resonance", 0.0, 0.0, 1.0, 0.05, False, (0.015, 0.05, 0.15), True
-            ),
+            shape("frequency_Hz", "Hz", "of the mass inside the mounts", 4.0, 400.0, 20.0, grid, none=np.inf),
+            shape("payload_share", "1", share, 0.05, 0.95, 0.2, (0.5,), optional=True, none=0.5),
+            shape("damping_ratio", "1", "of that resonance", 0.0, 1.0, 0.05, (0.015, 0.05, 0.15), optional=True),
             *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2),
         )
 
@@ -217,20 +186,9 @@ class LevelingLoop(OfMounts):
         if place.endswith("each"):
             return (rate, *uneven(range(1, LIBRARY.leveled), "rate of valve {} over the mean, less one"))
         # A valve may be faster than the data can show; its corner then ends at the upper bound.
-        return (
-            rate,
-            EffectParameter(
-                "valve_corner_Hz",
-                "Hz",
-                "first-order lag of the valves",
-                0.0,
-                *LIBRARY.valve_Hz,
-                1.0,
-                False,
-                (0.1, 0.3, 1.0, 3.0),
-                True,
-            ),
-        )
+        low, high, grid = *LIBRARY.valve_Hz, (0.1, 0.3, 1.0, 3.0)
+        lag = "first-order lag of the valves"
+        return (rate, EffectParameter.shape("valve_corner_Hz", "Hz", lag, low, high, 1.0, grid, optional=True))
 
     def implausible(self, values: Values, std: Values) -> str:
         slow = values.get("valve_corner_Hz", np.inf) < 1.001 * LIBRARY.valve_Hz[0]
@@ -351,19 +309,10 @@ class ContactFriction(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         rms, k = median_rms(model), float(np.mean(mount_geometry(model.rig).stiffness))
+        slips, words = [rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)], "displacement at which a contact slips"
         return (
             EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
-            EffectParameter(
-                "slip_m",
-                "m",
-                "displacement at which a contact slips",
-                0.0,
-                1e-3 * rms,
-                1e3 * rms,
-                rms,
-                False,
-                tuple(rms * x for x in (0.03, 0.1, 0.3, 1.0, 3.0, 10.0)),
-            ),
+            EffectParameter.shape("slip_m", "m", words, 1e-3 * rms, 1e3 * rms, rms, slips),
             *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"),
         )
 
@@ -434,22 +383,9 @@ class StiffnessDrift(OfMounts):
         if not place.endswith("settling"):
             return (change,)
         begin, end = campaign_clock(model)
-        T = end - begin
-        return (
-            change,
-            EffectParameter(
-                "time_constant_s",
-                "s",
-                "of the approach to the end",
-                0.0,
-                0.01 * T,
-                10 * T,
-                T,
-                False,
-                (0.1 * T, 0.3 * T, T),
-                True,
-            ),
-        )
+        T, words = end - begin, "of the approach to the end"
+        grid = (0.1 * T, 0.3 * T, T)
+        return (change, EffectParameter.shape("time_constant_s", "s", words, 0.01 * T, 10 * T, T, grid, optional=True))
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
         begin, end = record.campaign_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, Values, register
@@ -21,12 +23,8 @@ class ComOffset(Effect):
         return ("payload",) if "com_x" in model.rig.parameters() else ()
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        return tuple(
-            EffectParameter(
-                f"offset_{axis}_m", "m", f"centre of mass beyond the model's along {axis}", 0.0, -0.5, 0.5, 0.05
-            )
-            for axis in "xyz"
-        )
+        words = "centre of mass beyond the model's along {}"
+        return EffectParameter("offset_{}_m", "m", words, 0.0, -0.5, 0.5, 0.05).of_each("xyz")
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         known = model.rig.parameters()
@@ -46,18 +44,9 @@ class ProductOfInertia(Effect):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         known = model.rig.parameters()
-        largest = 0.9 * min(known[name].value for name in ("J1", "J2", "J3"))
-        return (
-            EffectParameter(
-                f"{place}_kgm2",
-                "kg m^2",
-                "entry of the inertia tensor beyond the model's",
-                0.0,
-                -largest,
-                largest,
-                0.1 * largest,
-            ),
-        )
+        most = 0.9 * min(known[name].value for name in ("J1", "J2", "J3"))
+        words = "entry of the inertia tensor beyond the model's"
+        return (EffectParameter(f"{place}_kgm2", "kg m^2", words, 0.0, -most, most, 0.1 * most),)
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         name = PRODUCTS[place]
@@ -68,20 +57,10 @@ class AtPoint(Effect):
     """An effect at a point of the payload."""
 
     def position(self) -> tuple[EffectParameter, ...]:
-        return tuple(
-            EffectParameter(
-                f"{axis}_m",
-                "m",
-                f"its place along {axis}, from the geometric centre",
-                0.0,
-                -SETTINGS.reach_m,
-                SETTINGS.reach_m,
-                0.2,
-                False,
-                grid,
-            )
-            for axis, grid in zip("xyz", ((-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)), strict=True)
-        )
+        most, words = SETTINGS.reach_m, "its place along {}, from the geometric centre"
+        each = EffectParameter.shape("{}_m", "m", words, -most, most, 0.2, ()).of_each("xyz")
+        grids = (-0.4, 0.0, 0.4), (-0.3, 0.0, 0.3), (-0.15, 0.25)
+        return tuple(replace(one, grid=grid) for one, grid in zip(each, grids, strict=True))
 
 
 def place_of(values: Values) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import SETTINGS, Effect, EffectParameter, Table, Values, register
 from avis_ctrl.gap.operators import Operators
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rigid_body import GRAVITY
+from avis_ctrl.rigs.rigid_body import GRAVITY, point_map
 
 
 def second_order(s: np.ndarray, frequency_Hz: float, damping: float) -> np.ndarray:
@@ -39,13 +39,15 @@ def axis_of(model: Table, sensor: str) -> str:
     return "xyz"[along[0]] if len(along) else ""
 
 
-class _OfSensor(Effect):
+class OfSensor(Effect):
+    """An effect of one sensor."""
+
     def places(self, model: Table) -> tuple[str, ...]:
         return model.sensors.names
 
 
 @register
-class GeophoneCorner(_OfSensor):
+class GeophoneCorner(OfSensor):
     """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter compensates a corner that does not exist.
 
     Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
@@ -76,7 +78,7 @@ class GeophoneCorner(_OfSensor):
 
 
 @register
-class SensorGain(_OfSensor):
+class SensorGain(OfSensor):
     """One sensitivity multiplied by a factor."""
 
     name = "sensor_gain"
@@ -91,7 +93,7 @@ class SensorGain(_OfSensor):
 
 
 @register
-class SensorMisalignment(_OfSensor):
+class SensorMisalignment(OfSensor):
     """Direction (e + a e1 + b e2)/norm instead of e; a, b are tangents of the tilt towards the two other earth axes."""
 
     name = "sensor_misalignment"
@@ -102,24 +104,16 @@ class SensorMisalignment(_OfSensor):
         return tuple(name for name in model.sensors.names if axis_of(model, name))
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        own = axis_of(model, place)
-        return tuple(
-            EffectParameter(f"towards_{axis}_deg", "deg", f"tilt of the axis towards {axis}", 0.0, -60.0, 60.0, 5.0)
-            for axis in "xyz"
-            if axis != own
-        )
+        one = EffectParameter("towards_{}_deg", "deg", "tilt of the axis towards {}", 0.0, -60.0, 60.0, 5.0)
+        return one.of_each("xyz".replace(axis_of(model, place), ""))
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        from avis_ctrl.rigs.rigid_body import point_map
-
         position, own = ops.base.rig.sensor_axes()[place]
         direction = own.copy()
         for name, angle in values.items():
             direction = direction + np.tan(np.radians(angle)) * np.eye(3)["xyz".index(name.split("_")[1])]
-        rows = ops.rows.copy()
-        rows[:, ops.sensor(place)] += direction / np.linalg.norm(direction) @ point_map(position) - own @ point_map(
-            position
-        )
+        rows, G = ops.rows.copy(), point_map(position)
+        rows[:, ops.sensor(place)] += direction / np.linalg.norm(direction) @ G - own @ G
         ops.rows = rows
 
 

@@ -121,10 +121,9 @@ def nominal_converter(rig: Rig) -> Converter:
     ------
     InputError : a rig without geophones or acquisition.
     """
-    acquisition = getattr(rig, "acquisition", None)
-    if acquisition is None:
+    if rig.converter is None:
         raise InputError("the rig file describes no converter", field="acquisition")
-    return Converter(acquisition.adc_bits, acquisition.adc_range_V, acquisition.sample_rate_Hz)
+    return rig.converter
 
 
 def inspect_converter(campaign: Campaign, rig: Rig) -> tuple[ConverterFinding, ...]:

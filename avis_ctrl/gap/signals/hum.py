@@ -135,7 +135,17 @@ def find_hum(residuals: Sequence[RecordResidual]) -> HumFinding | None:
     hits = np.argwhere((own < SETTINGS.false_alarm / own.size) | sure[at])
     frequency = _refined(residuals, frequency.value, hits)
     lines = _lines(residuals, frequency.value, hits, there.ratio[0])
-    return _finding(residuals, best.nominal_Hz, frequency, lines, chance, residuals[0].header.y_unit)
+    largest, header, nominal = lines[0], residuals[0].header, best.nominal_Hz
+    lines_Hz = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
+    channels = sorted({line.channel for line in lines}, key=header.y_names.index)
+    A = largest.amplitude
+    sentence = (
+        f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {lines_Hz} Hz in"
+        f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
+        f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{header.y_unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
+        " the lines next to it."
+    )
+    return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence)
 
 
 def polluted(
@@ -285,25 +295,3 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
         size = Reported(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
-
-
-def _finding(
-    residuals: Sequence[RecordResidual],
-    nominal: float,
-    frequency: Reported,
-    lines: tuple[HumLine, ...],
-    chance: float,
-    unit: str,
-) -> HumFinding:
-    largest = lines[0]
-    names = residuals[0].header.y_names
-    at = ", ".join(f"{k * nominal:g}" for k in sorted({line.harmonic for line in lines}))
-    channels = sorted({line.channel for line in lines}, key=names.index)
-    A = largest.amplitude
-    sentence = (
-        f"Mains hum of {frequency.value:.4f} +- {frequency.std:.1g} Hz with lines at {at} Hz in"
-        f" {', '.join(channels)}; the largest, at {largest.harmonic * nominal:g} Hz in {largest.channel}, has"
-        f" {1e3 * A.value:.4g} +- {1e3 * A.std:.2g} m{unit} peak, {10 * np.log10(largest.ratio):.0f} dB above"
-        " the lines next to it."
-    )
-    return HumFinding(nominal, frequency, lines, {"frequency_Hz": frequency, "amplitude_V": A}, 1 - chance, sentence)

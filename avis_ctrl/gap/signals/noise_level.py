@@ -83,38 +83,47 @@ SETTINGS = NoiseLevelSettings()
 class FloorLevel:
     """Velocity of the floor where it was not measured.
 
-    rms : of each direction in 0.5-60 Hz, with a power law beyond `seen_to_Hz`. seen : from 0.5 Hz to seen_to_Hz only.
-    ambient : of the rig file [m/s].
+    rms : of x, y and z, and their "mean", in 0.5-60 Hz, with a power law beyond `seen_to_Hz`. seen : from 0.5 Hz to
+    seen_to_Hz only. ambient : of the rig file [m/s].
     foreign : fraction of the excess over sensor noise that no floor motion explains, 0 to 1.
-    clear, significant : whether the floor is above ambient by a clear factor, and with statistical significance.
     """
 
     rms: dict[str, Reported]
     seen: dict[str, Reported]
     seen_to_Hz: dict[str, float]
-    mean_rms: Reported
-    mean_seen: Reported
     ambient: float
     foreign: float
-    significant: bool
-    clear: bool
 
     @property
     def parameters(self) -> dict[str, Reported]:
         """ "velocity_rms" (mean over directions) and "velocity_rms_x" ... [m/s] in 0.5-60 Hz."""
-        return {"velocity_rms": self.mean_rms} | {f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
+        return {"velocity_rms" if axis == "mean" else f"velocity_rms_{axis}": one for axis, one in self.rms.items()}
+
+    @property
+    def excess(self) -> float:
+        """Standard errors by which the highest of five estimates exceeds ambient."""
+        highest = (self.rms["mean"], *self.seen.values())
+        return max((one.value - self.ambient) / max(one.std, 1e-30) for one in highest)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the floor is above ambient by a clear factor."""
+        return any(
+            one.value > factor * self.ambient and one.value - SETTINGS.significant * one.std > self.ambient
+            for found, factor in ((self.seen, SETTINGS.seen_factor), (self.rms, SETTINGS.total_factor))
+            for one in found.values()
+        )
 
     @property
     def confidence(self) -> float:
         """1 - p, p an upper bound on the probability of estimates as high as these if the floor is at ambient."""
-        chance = 5 * float(norm.sf(_excess(self.ambient, self.mean_rms, self.mean_seen, self.seen)))
-        return 1 - min(chance, 1.0)
+        return 1 - min(5 * float(norm.sf(self.excess)), 1.0)
 
     @property
     def sentence(self) -> str:
         """The finding in one sentence."""
-        m, seen = self.mean_rms, self.mean_seen
-        each = ", ".join(f"{axis} {1e6 * one.value:.3g}" for axis, one in self.rms.items())
+        m, seen = self.rms["mean"], self.seen["mean"]
+        each = ", ".join(f"{axis} {1e6 * self.rms[axis].value:.3g}" for axis in "xyz")
         return (
             f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
             f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
@@ -140,7 +149,8 @@ class NoiseLevels:
     def ground_motion(self) -> FloorLevel | None:
         """The floor if it moves clearly more than stated in the rig file, and the source is the floor."""
         floor = self.floor
-        return floor if floor and floor.significant and floor.clear and floor.foreign <= SETTINGS.foreign else None
+        above = floor is not None and floor.excess > SETTINGS.significant and floor.clear
+        return floor if floor and above and floor.foreign <= SETTINGS.foreign else None
 
 
 def noise_levels(
@@ -324,38 +334,26 @@ def _level(
     S: np.ndarray, std: np.ndarray, visible: np.ndarray, edges: np.ndarray, ambient: float, foreign: float
 ) -> FloorLevel | None:
     width, centre = np.diff(edges), np.sqrt(edges[1:] * edges[:-1])
-    seen2, seen_v, all2, all_v = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    ends = {}
+    # Mean square of each direction, and its variance.
+    seen, whole, ends = np.zeros((3, 2)), np.zeros((3, 2)), {}
     for j, axis in enumerate("xyz"):
         m = int(np.argmin(np.append(visible[:, j], False)))
         if m < 3:
             return None
         ends[axis] = float(edges[m])
-        seen2[j], seen_v[j] = np.sum(S[:m, j] * width[:m]), np.sum((std[:m, j] * width[:m]) ** 2)
+        seen[j] = np.sum(S[:m, j] * width[:m]), np.sum((std[:m, j] * width[:m]) ** 2)
         tail, tail_std = _tail(centre[:m], S[:m, j], std[:m, j], edges[m])
-        all2[j], all_v[j] = seen2[j] + tail, seen_v[j] + tail_std**2
+        whole[j] = seen[j] + (tail, tail_std**2)
+    return FloorLevel(_rms(whole), _rms(seen), ends, ambient, foreign)
 
-    def root(square: float, variance: float) -> Reported:
+
+def _rms(squares: np.ndarray) -> dict[str, Reported]:
+    """R.m.s. velocities from the mean squares of x, y and z with their variances (3, 2); their "mean" first."""
+    found, mean = {}, (squares[:, 0].mean(), squares[:, 1].sum() / 9)
+    for axis, (square, variance) in zip(("mean", *"xyz"), (mean, *squares), strict=True):
         rms = np.sqrt(max(square, 1e-30))
-        return Reported(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
-
-    rms = {axis: root(all2[j], all_v[j]) for j, axis in enumerate("xyz")}
-    seen = {axis: root(seen2[j], seen_v[j]) for j, axis in enumerate("xyz")}
-    mean, mean_seen = root(all2.mean(), all_v.sum() / 9), root(seen2.mean(), seen_v.sum() / 9)
-
-    def above(one: Reported, factor: float) -> bool:
-        return one.value > factor * ambient and one.value - SETTINGS.significant * one.std > ambient
-
-    significant = _excess(ambient, mean, mean_seen, seen) > SETTINGS.significant
-    clear = any(above(one, SETTINGS.seen_factor) for one in (mean_seen, *seen.values())) or any(
-        above(one, SETTINGS.total_factor) for one in (mean, *rms.values())
-    )
-    return FloorLevel(rms, seen, ends, mean, mean_seen, ambient, foreign, significant, clear)
-
-
-def _excess(ambient: float, mean: Reported, mean_seen: Reported, seen: dict[str, Reported]) -> float:
-    """Standard errors by which the highest of these five estimates exceeds ambient."""
-    return max((one.value - ambient) / max(one.std, 1e-30) for one in (mean, mean_seen, *seen.values()))
+        found[axis] = Reported(float(rms), float(np.sqrt(variance) / (2 * rms)), "m/s")
+    return found
 
 
 def _tail(f: np.ndarray, S: np.ndarray, std: np.ndarray, end: float) -> tuple[float, float]:

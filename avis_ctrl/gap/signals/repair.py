@@ -8,7 +8,7 @@ repair again until the parameters converge.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import ConverterFinding, nominal_converter
 from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.rig import Rig
 
 
@@ -31,19 +32,19 @@ class Repaired:
 
 
 def channel_limits(
-    rig: Rig, names: tuple[str, ...], findings: tuple[ConverterFinding, ...] = ()
-) -> dict[str, tuple[float, float]]:
-    """Lowest and highest value [V] that each channel can show: as found, otherwise as in the rig file."""
-    limits = dict.fromkeys(names, nominal_converter(rig).limits_V)
-    for one in findings:
-        if one.kind == "clipping" and one.channel in limits:
-            low, high = limits[one.channel]
-            of = one.parameters
-            limits[one.channel] = (
-                of["clip_low_V"].value if "clip_low_V" in of else low,
-                of["clip_high_V"].value if "clip_high_V" in of else high,
-            )
-    return limits
+    converter: Converter | None, names: Sequence[str], found: Iterable[tuple[str | None, Mapping[str, float]]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest value (n_y,) [V] that each channel can show: range of the converter, or where it clips.
+
+    found : channel, and values by name of a converter's fault; "clip_low_V" and "clip_high_V" count.
+    """
+    low, high = (np.full(len(names), one) for one in (converter.limits_V if converter else (-np.inf, np.inf)))
+    for channel, values in found:
+        if channel in names:
+            k = names.index(channel)
+            low[k] = max(low[k], values.get("clip_low_V", -np.inf))
+            high[k] = min(high[k], values.get("clip_high_V", np.inf))
+    return low, high
 
 
 def repair(
@@ -64,9 +65,10 @@ def repair(
     if campaign.y_unit != "V":
         raise InputError("expected V: the converter clips in its own unit", field="unit of y", value=campaign.y_unit)
     names = campaign.y_names
-    limits = channel_limits(rig, names, findings)
-    low, high = (np.array([limits[name][k] for name in names]) for k in (0, 1))
-    margin = nominal_converter(rig).lsb_V / 2
+    converter = nominal_converter(rig)
+    found = [(one.channel, {key: p.value for key, p in one.parameters.items()}) for one in findings]
+    low, high = channel_limits(converter, names, found)
+    margin = converter.lsb_V / 2
     at, samples = np.zeros(len(names)), 0
     records = []
     for source in campaign.records:
