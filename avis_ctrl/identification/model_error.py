@@ -9,6 +9,7 @@ frequency, as the local polynomial requires.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -103,18 +104,10 @@ def _local(
 ) -> FrequencyResponse:
     # Directions that the records do not excite at all are missing in windows of any width.
     widths = SETTINGS.half_widths if excited_space(campaign, band_Hz).full else SETTINGS.half_widths[:1]
+    local = partial(local_polynomial, campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, longest_piece=longest_piece)
     for half_width in widths:
         try:
-            return local_polynomial(
-                campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width, longest_piece=longest_piece
-            )
+            return local(half_width=half_width)
         except ComputationError:
             continue
-    return local_polynomial(
-        campaign,
-        band_Hz=band_Hz,
-        frequency_Hz=frequency_Hz,
-        half_width=widths[-1],
-        longest_piece=longest_piece,
-        partial=True,
-    )
+    return local(half_width=widths[-1], partial=True)

@@ -174,25 +174,12 @@ class SensorModel:
         """Whether all sensors measure one kind of motion, in space, with one chain."""
         return len({*zip(self.motions, map(id, self.chains), strict=True)}) == 1 and not np.any(self.relative)
 
-    def _common(self) -> int:
+    @property
+    def common(self) -> tuple[Motion, StateSpace | None, tuple[float, ...]]:
+        """Motion, chain and poles of all sensors. Raises InputError if they differ."""
         if not self.alike:
             raise InputError("expected sensors of one kind, with one chain", field="sensors", value=list(self.motions))
-        return 0
-
-    @property
-    def motion(self) -> Motion:
-        """Motion that all sensors measure. Raises InputError if they differ."""
-        return self.motions[self._common()]
-
-    @property
-    def chain(self) -> StateSpace | None:
-        """Chain of all sensors. Raises InputError if they differ."""
-        return self.chains[self._common()]
-
-    @property
-    def transient_poles(self) -> tuple[float, ...]:
-        """Denominator coefficients of all sensors. Raises InputError if they differ."""
-        return self.poles[self._common()]
+        return self.motions[0], self.chains[0], self.poles[0]
 
     def sense(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) response from displacement to y of unit sensitivity."""
