@@ -72,21 +72,11 @@ def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
         )
     few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
     if len(seen) == 1:
-        plain = all(weight in seen[0].words for weight in members) and " - " not in seen[0].words
-        sort = (
-            "their sum"
-            if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0]))
-            else "one combination"
-        )
+        plain = seen[0].words.removeprefix("(").partition(")")[0] == " + ".join(members)
+        sort = "their sum" if plain else "one combination"
         return f"{few} {'is' if len(members) == 1 else 'are'} determined only as {sort}: {known_text(seen[0])}."
     shown = "; ".join(known_text(one) for one in seen[:8]) + ("; .." if len(seen) > 8 else "")
     return f"{few} ({len(members)}) are determined only through {len(seen)} combinations: {shown}."
-
-
-def _coefficients(one: Combination) -> str:
-    """Coefficients of the names in a sum."""
-    inner = one.words.partition(")")[0].removeprefix("(") if one.words.startswith("(") else one.words
-    return "".join(term.strip().rpartition(" ")[0] for term in inner.split(" + "))
 
 
 def _upper(text: str) -> str:

@@ -61,13 +61,9 @@ class Unexplained(RecordSource):
             self.predictor, self.at = Predictor(self.model, large_motion=True), 0
         piece = self.record.load(self.at, stop)
         read = self.predictor.read(*model_inputs(self.model, piece))
-        keep, self.at = slice(start - self.at, None), stop
-        y = piece.y.copy()
+        y, before, self.at = piece.y.copy(), start - self.at, stop
         y[:, self.columns] -= read
-        header = replace(
-            piece.header, samples=stop - start, start_s=self.header.start_s + start / self.header.sample_rate_Hz
-        )
-        return Record(header, piece.u[keep], y[keep], None if piece.floor is None else piece.floor[keep])
+        return replace(piece, y=y).load(before)
 
 
 def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
