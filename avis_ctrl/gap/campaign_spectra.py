@@ -159,7 +159,7 @@ def all_silent(campaign: Campaign, blocks: Sequence[SpectralBlock]) -> bool:
 
 def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
     try:
-        return measured_noise(campaign, block, band_Hz)
+        return measured_noise([block], campaign, band_Hz)[0]
     except AvisError:
         pass
     # Where the floor does not move in part of the band, floor and drives cannot be separated there. The response to the
@@ -169,9 +169,8 @@ def _local(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float
         record = source.load()
         records.append(Record(replace(record.header, floor_names=()), record.u, record.y, None))
     try:
-        found = measured_noise(
-            replace(campaign, records=tuple(records)), replace(block, kind="floor not measured"), band_Hz
-        )
+        still = replace(block, kind="floor not measured")
+        found = measured_noise([still], replace(campaign, records=tuple(records)), band_Hz)[0]
         return replace(found, kind=block.kind)
     except AvisError as error:
         raise InputError(
@@ -224,4 +223,4 @@ def _residual(block: SpectralBlock, model: TableModel) -> Residual:
         residual = prediction_error(model, block.with_noise(weights.astype(complex)), derivative=False)
         found = np.mean(np.abs(residual.error) ** 2, axis=2)
         power = np.stack([(np.bincount(octave, one) / lines)[octave] for one in found.T], axis=1)
-    return Residual(block, residual.error, residual.white, np.zeros_like(residual.error))
+    return Residual(block, residual.error, residual.error, residual.white)

@@ -250,8 +250,8 @@ def realise(model: TableModel, pade_order: int | None = None, when: float = 0.0)
     ------
     InputError : sensors of displacement or acceleration; mounts whose chassis points differ from the payload's.
     """
-    if model.sensors.motion != "velocity":
-        raise InputError("expected sensors of velocity", field="sensors", value=model.sensors.motion)
+    if (motion := model.sensors.common[0]) != "velocity":
+        raise InputError("expected sensors of velocity", field="sensors", value=motion)
     omega = 2 * np.pi * np.geomspace(*SETTINGS.check_Hz)
     order = pade_order or sufficient_order(loop_lag(model)[0], float(omega.max()), 1e-3, 10)[0]
     effective, names = model.effective, [edge_name(name) for name in COORDINATES]
@@ -317,7 +317,7 @@ def _loop(model: TableModel, order: int) -> StateSpace:
 def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
     """Velocities, differences and gravity rates to the sensors' own unit; the two zeros at the origin cancel s^-2."""
     model, n_y = table.model, table.n_y
-    nominal, chain = table.rows(table.matrices.R), model.sensors.chain
+    nominal, (_, chain, poles) = table.rows(table.matrices.R), model.sensors.common
     if chain is None and np.any(_tilt_rows(table)):
         raise InputError(
             "expected sensors with a high-pass: ideal ones would integrate gravity twice",
@@ -329,9 +329,7 @@ def _chains(table: ReducedTable, names: list[str]) -> StateSpace:
         chain = gain([[1.0]])
     else:
         # Without the zeros at the origin: from the rate of acceleration to the output of the chain.
-        tilt = cascade(
-            [], list(np.roots(model.sensors.transient_poles[::-1])), float(np.prod(np.abs(model.sensors.low_pass)))
-        )
+        tilt = cascade([], list(np.roots(poles[::-1])), float(np.prod(np.abs(model.sensors.low_pass))))
     motion = append(*[chain] * n_y).scaled(S, np.hstack([nominal, np.eye(n_y), np.zeros((n_y, n_y))]))
     felt = append(*[tilt] * n_y).scaled(S, np.hstack([np.zeros((n_y, len(names) + n_y)), np.eye(n_y)]))
     sensors = model.sensors.names

@@ -25,10 +25,10 @@ from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
 from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile
-from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitener
+from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitened_transient, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q
-from avis_ctrl.identification.spectra import span, transient_columns, transient_parts
+from avis_ctrl.identification.spectra import transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import with_distortion
 
@@ -111,9 +111,7 @@ class Part:
         self.inner: np.ndarray | None = None
         self.response = TableResponse(self.made, self._acting(model))
         if block.transient:
-            columns, norms = transient_columns(block, model)
-            T = as_real(np.moveaxis(whitened(self.L, columns), -1, 0))
-            self.transient, X = span(T.T)
+            _, norms, self.transient, X = whitened_transient(model, block, self.L)
             residual = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
             self.body, self.inner = transient_parts(X @ (self.transient.T @ residual), norms, block, model)
             self.response = TableResponse(self.made, self._acting(model))

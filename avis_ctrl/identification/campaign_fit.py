@@ -21,7 +21,7 @@ from avis_ctrl.identification.second_order import chosen_turning, terms, without
 from avis_ctrl.identification.spectra import record_block, response_block, thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
-from avis_ctrl.measurement.campaign import Campaign, Portion, RecordSource
+from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
 from avis_ctrl.rigs.avis import AvisTable
@@ -138,8 +138,12 @@ def levels_of(records: Sequence[RecordSource]) -> dict[str, float]:
 
 def drive_power(record: RecordSource) -> np.ndarray:
     """(n_u, n_u) sum of u u^T over the first quarter of a million samples."""
-    u = record.load(0, min(record.header.samples, SETTINGS.longest_piece)).u
+    u = _beginning(record).u
     return u.T @ u
+
+
+def _beginning(record: RecordSource) -> Record:
+    return record.load(0, min(record.header.samples, SETTINGS.longest_piece))
 
 
 def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
@@ -162,8 +166,8 @@ def excites_as_well(others: np.ndarray, one: np.ndarray) -> bool:
 
 def driven_inputs(record: RecordSource) -> set[str]:
     """Inputs that are not zero in the first quarter of a million samples."""
-    piece = record.load(0, min(record.header.samples, SETTINGS.longest_piece))
-    return {name for name, column in zip(piece.header.u_names, piece.u.T, strict=True) if np.any(column)}
+    powers = np.diag(drive_power(record))
+    return {name for name, power in zip(record.header.u_names, powers, strict=True) if power}
 
 
 def divided(record: RecordSource) -> tuple[Portion, Portion]:
@@ -190,7 +194,7 @@ def excited_band(campaign: Campaign) -> tuple[float, float]:
     """
     ends: list[tuple[float, float]] = []
     for record in campaign.records:
-        piece = record.load(0, min(record.header.samples, SETTINGS.longest_piece))
+        piece = _beginning(record)
         drive = piece.u if np.any(piece.u) else piece.floor
         if drive is None or not np.any(drive) or record.header.excitation == "rest":
             continue
@@ -252,39 +256,19 @@ def weighted(
 ) -> tuple[list[SpectralBlock], str, bool]:
     """The blocks with noise measured by a local model, independent of the rig's; a sentence, and whether it
     succeeded."""
-    known: dict[str, tuple[np.ndarray, SpectralBlock]] = {}
     try:
-        found = []
-        for block in blocks:
-            if block.kind not in known:
-                # On the lines of all blocks of this kind at once: the local model is that of the whole campaign.
-                omega = np.unique(np.concatenate([one.omega for one in blocks if one.kind == block.kind]))
-                known[block.kind] = omega, measured_noise(campaign, _lines_only(block, omega), band_Hz)
-            omega, like = known[block.kind]
-            assert like.noise is not None
-            found.append(block.with_noise(like.noise[np.searchsorted(omega, block.omega)], like.dof))
+        found = measured_noise(blocks, campaign, band_Hz)
     except AvisError as error:
-        return (
-            relative_noise(blocks),
-            (f"no measured noise covariance ({error}); the first fit gives all lines equal weight"),
-            False,
-        )
-    return (
-        found,
-        (f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom per line"),
-        True,
-    )
+        said = f"no measured noise covariance ({error}); the first fit gives all lines equal weight"
+        return relative_noise(blocks), said, False
+    said = f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom per line"
+    return found, said, True
 
 
-def _lines_only(block: SpectralBlock, omega: np.ndarray) -> SpectralBlock:
-    """A block of the same kind on other lines, without data."""
-    return replace(
-        block, omega=omega, U=np.zeros((len(omega), block.U.shape[1], 1)), Y=np.zeros((len(omega), block.Y.shape[1], 1))
-    )
-
-
-def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[float, float]) -> SpectralBlock:
-    """A block with the noise covariance of a local polynomial model of the campaign's records of its kind.
+def measured_noise(
+    blocks: Sequence[SpectralBlock], campaign: Campaign, band_Hz: tuple[float, float]
+) -> list[SpectralBlock]:
+    """Blocks with the noise covariance of a local polynomial model of the campaign's records of their kind.
 
     Records at rest are used if there are any, otherwise all records.
 
@@ -292,18 +276,26 @@ def measured_noise(campaign: Campaign, block: SpectralBlock, band_Hz: tuple[floa
     ------
     InputError, ComputationError : records that do not allow it.
     """
-    floor = block.kind == "floor measured"
-    alike = [record.header for record in campaign.records if (len(record.header.floor_names) > 0) == floor]
-    # A record at rest contains noise alone; in any other record all inputs must be separated first.
-    rest = [header for header in alike if header.excitation == "rest"]
-    campaign = campaign.only(tuple(header.name for header in rest or alike))
-    frequency = block.omega / (2 * np.pi)
-    at = np.unique(np.clip(np.linspace(frequency[0], frequency[-1], min(len(frequency), 1500)), *band_Hz))
-    noise = noise_covariance(
-        campaign, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=SETTINGS.longest_piece
-    )
-    above = np.clip(np.searchsorted(at, frequency), 0, len(at) - 1)
-    return block.with_noise(noise.covariance[above], float(np.median(noise.dof)))
+    found: dict[str, tuple[np.ndarray, np.ndarray, float]] = {}
+    for kind in dict.fromkeys(block.kind for block in blocks):
+        floor = kind == "floor measured"
+        alike = [record.header for record in campaign.records if (len(record.header.floor_names) > 0) == floor]
+        # A record at rest contains noise alone; in any other record all inputs must be separated first.
+        rest = [header for header in alike if header.excitation == "rest"]
+        records = campaign.only(tuple(header.name for header in rest or alike))
+        lines = np.unique(np.concatenate([one.omega for one in blocks if one.kind == kind])) / (2 * np.pi)
+        at = np.unique(np.clip(np.linspace(lines[0], lines[-1], min(len(lines), 1500)), *band_Hz))
+        noise = noise_covariance(
+            records, at, band_Hz=band_Hz, floor=floor, smooth_Hz=0.3, longest_piece=SETTINGS.longest_piece
+        )
+        found[kind] = at, noise.covariance, float(np.median(noise.dof))
+
+    def with_noise(block: SpectralBlock) -> SpectralBlock:
+        at, covariance, dof = found[block.kind]
+        above = np.clip(np.searchsorted(at, block.omega / (2 * np.pi)), 0, len(at) - 1)
+        return block.with_noise(covariance[above], dof)
+
+    return [with_noise(block) for block in blocks]
 
 
 @dataclass(frozen=True, eq=False)

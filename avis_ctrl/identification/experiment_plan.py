@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg
 
 from avis_ctrl.identification.experiments import Added, Drive, Noise, changed, predicted_information
-from avis_ctrl.identification.identifiability import IdentifiabilityReport, identifiability_report
-from avis_ctrl.identification.identifiability_text import combination_text, listed, number
+from avis_ctrl.identification.identifiability import identifiability_report
+from avis_ctrl.identification.identifiability_text import combination_text, listed
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.structure import structural_null_space, structure_of
@@ -73,32 +73,22 @@ class Outcome:
 
     experiment: Experiment
     information: Information
-    rank: int
     gained: int
     alone: Mapping[str, float]
     tighter: float
 
     @property
     def words(self) -> str:
-        """What the experiment adds, as a sentence."""
-        if not self.gained:
-            sharper = (
-                f"the known standard deviations decrease by a factor of {number(self.tighter)}"
-                if self.tighter > 1.005
-                else "no standard deviation decreases"
-            )
-            return f"{self.experiment.words}: determines no further combination; {sharper}."
+        """The combinations that the experiment adds, as a sentence."""
         many = "combination" if self.gained == 1 else "combinations"
-        return f"{self.experiment.words}: determines {self.gained} more {many}{_alone_text(self.alone)}."
-
-
-def _alone_text(alone: Mapping[str, float]) -> str:
-    if not alone:
-        return ""
-    shown = [f"{name} to {number(100 * share)} %" for name, share in list(alone.items())[:6]]
-    if len(alone) > 6:
-        shown.append(f"{len(alone) - 6} more parameters (the worst to {number(100 * max(alone.values()))} %)")
-    return f", so that these parameters are determined individually: {listed(shown)}"
+        said = f"{self.experiment.words}: determines {self.gained} more {many}"
+        if not self.alone:
+            return f"{said}."
+        shown = [f"{name} to {100 * share:.3g} %" for name, share in list(self.alone.items())[:6]]
+        if len(self.alone) > 6:
+            worst = 100 * max(self.alone.values())
+            shown.append(f"{len(self.alone) - 6} more parameters (the worst to {worst:.3g} %)")
+        return f"{said}, so that these parameters are determined individually: {listed(shown)}."
 
 
 Predictions = list[tuple[Experiment, Information]]
@@ -112,111 +102,64 @@ def candidates(model: ResponseModel, drive: Drive) -> tuple[Experiment, ...]:
     chassis measures the floor, which is a separate candidate.
     """
     low, high = drive.band_Hz
-    rate = 1 / model.period_s if model.period_s else 1000.0
-    found = [Experiment("Record four times as long", replace(drive, duration_s=3 * drive.duration_s))]
+    rate, once = 1 / model.period_s if model.period_s else 1000.0, "Record once more"
+    drives = {"Record four times as long": replace(drive, duration_s=3 * drive.duration_s)}
     level = min(3 * drive.level_V, float(np.min(model.rig.drive_limits_V())) / 4)
     if level > drive.level_V:
-        found.append(
-            Experiment(
-                f"Record once more with {number(level)} V r.m.s. at each actuator", replace(drive, level_V=level)
-            )
-        )
-    found.append(
-        Experiment(
-            f"Record once more over {number(low / 5)}-{number(low)} Hz, below the present band",
-            replace(drive, band_Hz=(low / 5, low)),
-        )
-    )
+        drives[f"{once} with {level:.3g} V r.m.s. at each actuator"] = replace(drive, level_V=level)
+    drives[f"{once} over {low / 5:.3g}-{low:.3g} Hz, below the present band"] = replace(drive, band_Hz=(low / 5, low))
     if 3 * high < 0.45 * rate:
-        found.append(
-            Experiment(
-                f"Record once more over {number(high)}-{number(3 * high)} Hz, above the present band",
-                replace(drive, band_Hz=(high, 3 * high)),
-            )
-        )
+        words = f"{once} over {high:.3g}-{3 * high:.3g} Hz, above the present band"
+        drives[words] = replace(drive, band_Hz=(high, 3 * high))
+    speed = SETTINGS.floor_m_per_s
     for axis in FLOOR:
-        found.append(
-            Experiment(
-                f"Shake the floor along {axis[-1]} ({number(1e3 * SETTINGS.floor_m_per_s)} mm/s r.m.s.) "
-                "and measure its velocity",
-                replace(drive, level_V=0.0, floor_m_per_s={axis: SETTINGS.floor_m_per_s}),
-            )
-        )
-    return (*found, *_changed_rigs(model, drive), *_more_channels(model, drive), *_bench(model))
-
-
-def _changed_rigs(model: ResponseModel, drive: Drive) -> list[Experiment]:
-    body = model.rig.mounted_body()
-    kg, corner = round(0.1 * body.mass, 3), body.mounts[0].position
-    at = ", ".join(f"{v:g}" for v in corner)
-    found = [
-        Experiment(
-            f"Record once more with a known mass of {kg:g} kg fixed at ({at}) m", drive, {"masses": [(kg, corner)]}
-        )
-    ]
-    numbers = sorted(
-        {int(name[8:-4]) for name in model.rig.parameters() if name.startswith("isolator") and name.endswith(".p_x")}
+        words = f"Shake the floor along {axis[-1]} ({1e3 * speed:.3g} mm/s r.m.s.) and measure its velocity"
+        drives[words] = replace(drive, level_V=0.0, floor_m_per_s={axis: speed})
+    return (
+        *(Experiment(words, one) for words, one in drives.items()),
+        *(Experiment(words, drive, change) for words, change in _changes(model).items()),
+        *(Experiment(words, bench=known) for words, known in _bench(model).items()),
     )
+
+
+def _changes(model: ResponseModel) -> dict[str, dict[str, Any]]:
+    """Changes of the rig before one more record, by what to do."""
+    body, once = model.rig.mounted_body(), "Record once more with"
+    kg, corner = round(0.1 * body.mass, 3), body.mounts[0].position
+    x, y, z = corner
+    top = (-x, -y, -z)
+    at, opposite = (f"({', '.join(f'{v:g}' for v in place)}) m" for place in (corner, top))
+    found: dict[str, dict[str, Any]] = {f"{once} a known mass of {kg:g} kg fixed at {at}": {"masses": [(kg, corner)]}}
     for axis in "xyz":
         for picked in ([1], [1, 3]):
-            if not set(picked) <= set(numbers):
-                continue
             shifts = {f"isolator{i}.p_{axis}": 0.05 for i in picked}
-            who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
-            how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
-            found.append(
-                Experiment(
-                    f"Record once more with {who} {how}, with the motors and sensors in it", drive, {"shifts": shifts}
-                )
-            )
-    return found
-
-
-def _more_channels(model: ResponseModel, drive: Drive) -> list[Experiment]:
-    x, y, z = model.rig.mounted_body().mounts[0].position
-    top, found = (-x, -y, -z), []
+            if shifts.keys() <= model.rig.parameters().keys():
+                who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
+                how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
+                found[f"{once} {who} {how}, with the motors and sensors in it"] = {"shifts": shifts}
     for axis, direction in {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}.items():
-        sensor = Added(f"added sensor {axis}", top, direction)
-        found.append(
-            Experiment(
-                f"Add a calibrated sensor along {axis} on the payload at "
-                f"({', '.join(f'{v:g}' for v in top)}) m and record once more",
-                drive,
-                {"sensors": [sensor]},
-            )
-        )
-    constant = float(np.max(np.abs(model.matrices.T)))
-    motor = Added("added actuator", top, (0.0, 0.0, 1.0), constant)
-    found.append(
-        Experiment(
-            "Add a calibrated vertical actuator at the same place and record once more", drive, {"actuators": [motor]}
-        )
-    )
+        words = f"Add a calibrated sensor along {axis} on the payload at {opposite} and record once more"
+        found[words] = {"sensors": [Added(f"added sensor {axis}", top, direction)]}
+    motor = Added("added actuator", top, (0.0, 0.0, 1.0), float(np.max(np.abs(model.matrices.T))))
+    found["Add a calibrated vertical actuator at the same place and record once more"] = {"actuators": [motor]}
     return found
 
 
-def _bench(model: ResponseModel) -> list[Experiment]:
-    """Single parameters that a bench or a balance can measure: from each group as many as determine the rest."""
-    null = structural_null_space(model)
-    structure = structure_of(null, model.values, model.units, model.names)
+def _bench(model: ResponseModel) -> dict[str, dict[str, float]]:
+    """Single parameters that a bench or a balance can measure, by what to do: from each group as many as determine the
+    rest."""
+    structure = structure_of(structural_null_space(model), model.values, model.units, model.names)
     picked = [model.names[j] for group in structure.groups for j in _independent(group.unseen)]
     mounts = [name for name in picked if name.rpartition(".")[2].startswith(("k_", "c_"))]
-    found = []
+    found = {}
     if mounts:
-        found.append(
-            Experiment(
-                f"Measure single mounts on a bench, to {number(100 * SETTINGS.bench)} % each: {listed(mounts)}",
-                bench=dict.fromkeys(mounts, SETTINGS.bench),
-            )
-        )
+        words = f"Measure single mounts on a bench, to {100 * SETTINGS.bench:.3g} % each: {listed(mounts)}"
+        found[words] = dict.fromkeys(mounts, SETTINGS.bench)
     if "mass" in model.names:
-        found.append(Experiment("Weigh the payload to 0.5 %", bench={"mass": 0.005}))
-    sensors = [name for name in model.names if name.startswith("sensor.")]
-    if sensors:
-        found.append(Experiment(f"Calibrate {sensors[0]} to 1 %", bench={sensors[0]: 0.01}))
-    actuators = [name for name in model.names if name.startswith("actuator.")]
-    if actuators:
-        found.append(Experiment(f"Measure {actuators[0]} with a load cell to 1 %", bench={actuators[0]: 0.01}))
+        found["Weigh the payload to 0.5 %"] = {"mass": 0.005}
+    for kind, how in (("sensor", "Calibrate {} to 1 %"), ("actuator", "Measure {} with a load cell to 1 %")):
+        for name in [name for name in model.names if name.startswith(f"{kind}.")][:1]:
+            found[how.format(name)] = {name: 0.01}
     return found
 
 
@@ -254,7 +197,7 @@ def _outcome(before: Information, experiment: Experiment, added: Information) ->
         before.of(row)[1] / after.of(row)[1] for row in (V / before.scale[:, None]).T if np.isfinite(after.of(row)[1])
     ]
     tighter = float(np.median(ratios)) if ratios else 1.0
-    return Outcome(experiment, after, after.rank, after.rank - before.rank, alone, tighter)
+    return Outcome(experiment, after, after.rank - before.rank, alone, tighter)
 
 
 def planned(information: Information, added: Predictions) -> tuple[Outcome, ...]:
@@ -276,13 +219,10 @@ def needed_experiment(
     drive: Drive,
     noise: Noise,
     experiments: Sequence[Experiment] | None = None,
-    report: IdentifiabilityReport | None = None,
 ) -> tuple[str, ...]:
     """Sentences: what determines the missing combinations, what does not, and the shortest sequence found for all of
     them."""
-    report = report or identifiability_report(information, model)
-    missing = len(information.names) - information.rank
-    if not missing:
+    if information.rank == len(information.names):
         return ("Every combination is determined; further records only make it more precise.",)
     chosen = candidates(model, drive) if experiments is None else experiments
     added = predicted(model, chosen, noise)
@@ -291,28 +231,16 @@ def needed_experiment(
     useless = [f"{one.experiment.words[:1].lower()}{one.experiment.words[1:]}" for one in outcomes if not one.gained]
     if useless:
         said.append(f"These determine no further combination: {'; '.join(dict.fromkeys(useless))}.")
-    steps = planned(information, added)
+    steps, left = planned(information, added), information
     if steps:
-        after = steps[-1].information
+        left = steps[-1].information
         order = " Then: ".join(one.experiment.words + "." for one in steps)
-        worst = np.max(after.standard_deviation / after.scale)
-        rest = len(after.names) - after.rank
+        worst, rest = 100 * np.max(left.standard_deviation / left.scale), len(left.names) - left.rank
+        after = f"Every parameter is then determined individually, the least precise to {worst:.3g} %."
         said.append(
-            f"Shortest sequence found: {order} "
-            + (
-                f"Every parameter is then determined individually, the least precise to {number(100 * worst)} %."
-                if not rest
-                else f"{rest} combinations remain undetermined."
-            )
+            f"Shortest sequence found: {order} {f'{rest} combinations remain undetermined.' if rest else after}"
         )
-        left = after
-    else:
-        left = information
     if left.rank < len(left.names):
-        still = identifiability_report(left)
-        said.append(
-            "None of these experiments determines: "
-            + "; ".join(combination_text(row.items()) for row in still.unseen[:8])
-            + "."
-        )
+        still = "; ".join(combination_text(row.items()) for row in identifiability_report(left).unseen[:8])
+        said.append(f"None of these experiments determines: {still}.")
     return (*said, CAUTION)

@@ -62,38 +62,23 @@ class Added(NamedTuple):
 class ChangedModel(ResponseModel):
     """A model with known masses, sensors and actuators added, and parameters changed by known amounts.
 
-    masses : (kg, place) each, a point mass. The parameters remain those of the rig without them.
+    own : the model without them, whose channels come first. masses : (kg, place) each, a point mass. The parameters
+    remain those of the rig without them.
     """
 
+    own: ResponseModel = field(kw_only=True)
     masses: tuple[tuple[float, Place], ...] = ()
     more_sensors: tuple[Added, ...] = ()
     more_actuators: tuple[Added, ...] = ()
 
     def __post_init__(self) -> None:
-        self._own()  # raises for names that the rig does not have
+        """The names of `own` were checked; others than the rig's are allowed here."""
 
     def matrices_of(self, rig: Rig) -> Matrices:
-        own = self._own().matrices_of(rig)
+        own = self.own.matrices_of(rig)
         M = own.M + sum((kg * point_map(place).T @ point_map(place) for kg, place in self.masses), np.zeros((6, 6)))
         R = np.vstack([own.R, *(one.row for one in self.more_sensors)])
         return own._replace(M=M, R=R, T=np.column_stack([own.T, *(one.row for one in self.more_actuators)]))
-
-    def _own(self) -> ResponseModel:
-        """The model with only the rig's own channels and parameters."""
-        n_y, n_u = (
-            len(all_) - len(more)
-            for all_, more in ((self.sensors.names, self.more_sensors), (self.actuators, self.more_actuators))
-        )
-        names = tuple(name for name in self.names if name in self.rig.parameters())
-        return ResponseModel(
-            self.rig,
-            names,
-            self.sensors.picked(range(n_y)),
-            self.actuators[:n_u],
-            self.period_s,
-            self.delay_s,
-            self.amplifier_corner_Hz,
-        )
 
 
 def changed(
@@ -114,15 +99,8 @@ def changed(
     rig = model.rig.with_parameters({name: known[name].value + shift for name, shift in (shifts or {}).items()})
     own = len(model.sensors.names)
     # Added sensors are of the kind of the first one, with the mean sensitivity of that kind.
-    gain = float(
-        np.mean(
-            [
-                value
-                for value, motion in zip(model.sensors.sensitivity, model.sensors.motions, strict=True)
-                if motion == model.sensors.motions[0]
-            ]
-        )
-    )
+    alike = [motion == model.sensors.motions[0] for motion in model.sensors.motions]
+    gain = float(np.mean(model.sensors.sensitivity[alike]))
     bank = replace(
         model.sensors.picked([*range(own), *([0] * len(sensors))]),
         names=(*model.sensors.names, *(one.name for one in sensors)),
@@ -140,6 +118,7 @@ def changed(
         tuple(masses),
         tuple(sensors),
         tuple(actuators),
+        own=model,
     )
 
 

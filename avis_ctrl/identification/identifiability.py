@@ -11,7 +11,6 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.identifiability_text import (
     combination_text,
     group_sentence,
-    number,
     scaling_sentence,
     unit_text,
     weak_direction_sentence,
@@ -90,9 +89,14 @@ def identifiability_report(
         structure = structure_of(
             _orthonormal(null * (information.scale / size_of(values))[:, None]), values, units, names
         )
-    combinations = _combinations(information, structure)
+    of_groups = [[_combination(information, structure, row) for row in group.seen] for group in structure.groups]
+    alone = [_combination(information, structure, row) for row in np.eye(len(names))[list(structure.singles)]]
+    places = [min(group.members) for group in structure.groups for _ in group.seen]
+    found = [one for own in of_groups for one in own] + alone
+    order = np.argsort([*places, *structure.singles], kind="stable")
+    combinations = tuple(found[k] for k in order)
     unseen = tuple(_by_name(row, names) for group in structure.groups for row in group.unseen)
-    said = _sentences(information, structure, combinations)
+    said = _sentences(information, structure, combinations, of_groups, alone)
     if model is not None and own.shape[1] > null.shape[1]:
         said = (*said, _prior_sentence(own.shape[1] - null.shape[1], priors or {}))
     return IdentifiabilityReport(
@@ -112,12 +116,6 @@ def _left_dark(information: Information, null: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh((inside + inside.T) / 2)
     floor = 4 * len(null) * np.finfo(float).eps * np.max(np.linalg.eigvalsh(information.relative))
     return null @ vectors[:, values <= max(1 / INFORMATION.undetermined**2, floor)]
-
-
-def _combinations(information: Information, structure: Structure) -> tuple[Combination, ...]:
-    rows = [(min(group.members), row) for group in structure.groups for row in group.seen]
-    rows += [(j, np.eye(len(information.names))[j]) for j in structure.singles]
-    return tuple(_combination(information, structure, row) for _, row in sorted(rows, key=lambda pair: pair[0]))
 
 
 def _combination(information: Information, structure: Structure, row: np.ndarray) -> Combination:
@@ -152,13 +150,19 @@ def _by_name(row: np.ndarray, names: Sequence[str]) -> dict[str, float]:
     return {name: float(weight) for name, weight in zip(names, row, strict=True) if weight}
 
 
-def _sentences(information: Information, structure: Structure, combinations: Sequence[Combination]) -> tuple[str, ...]:
+def _sentences(
+    information: Information,
+    structure: Structure,
+    combinations: Sequence[Combination],
+    of_groups: Sequence[Sequence[Combination]],
+    singles: Sequence[Combination],
+) -> tuple[str, ...]:
     names, count = information.names, len(information.names)
     alone = [name for name, known in zip(names, information.known, strict=True) if known]
     said = [
         f"The data determine {information.rank} combinations of the {count} parameters; the relative standard "
         f"deviations of the most and the least precise one differ by a factor of "
-        f"{number(np.sqrt(information.condition))}."
+        f"{np.sqrt(information.condition):.3g}."
         if information.rank
         else f"The data determine none of the combinations of the {count} parameters."
     ]
@@ -168,19 +172,11 @@ def _sentences(information: Information, structure: Structure, combinations: Seq
         said.append(f"Determined individually ({len(alone)}): {', '.join(alone)}.")
     said += [scaling_sentence(one, information) for one in structure.scalings]
     if structure.scalings:
-        shared = [
-            text
-            for text in (
-                _combination(information, structure, row).words for row in np.eye(count)[list(structure.singles)]
-            )
-            if text not in names
-        ]
+        shared = [one.words for one in singles if one.words not in names]
         if shared:
             said.append(f"Determined as such ratios and products ({len(shared)}): {', '.join(shared)}.")
-    by_text = {one.words: one for one in combinations}
-    for group in structure.groups:
-        own = [by_text[_combination(information, structure, row).words] for row in group.seen]
-        said.append(group_sentence([names[j] for j in group.members], own))
+    for group, seen in zip(structure.groups, of_groups, strict=True):
+        said.append(group_sentence([names[j] for j in group.members], seen))
     poor = [one for one in combinations if not one.determined]
     if poor:
         said.append(

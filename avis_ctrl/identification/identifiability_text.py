@@ -11,20 +11,16 @@ from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.structure import Scaling
 
 _KINDS = {
-    "kg": ("mass", "masses"),
-    "kg m^2": ("inertia", "inertias"),
-    "N/m": ("stiffness", "stiffnesses"),
-    "N m/rad": ("rotational stiffness", "rotational stiffnesses"),
-    "N s/m": ("damping", "dampings"),
-    "N m s/rad": ("rotational damping", "rotational dampings"),
-    "N/V": ("force constant", "force constants"),
-    "m": ("length", "lengths"),
+    "sensor": "sensor sensitivities",
+    "kg": "masses",
+    "kg m^2": "inertias",
+    "N/m": "stiffnesses",
+    "N m/rad": "rotational stiffnesses",
+    "N s/m": "dampings",
+    "N m s/rad": "rotational dampings",
+    "N/V": "force constants",
+    "m": "lengths",
 }
-
-
-def number(value: float) -> str:
-    """Number with three digits."""
-    return f"{value:.3g}"
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:
@@ -76,21 +72,11 @@ def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
         )
     few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
     if len(seen) == 1:
-        plain = all(weight in seen[0].words for weight in members) and " - " not in seen[0].words
-        sort = (
-            "their sum"
-            if plain and not any(ch.isdigit() and ch != "0" for ch in _coefficients(seen[0]))
-            else "one combination"
-        )
+        plain = seen[0].words.removeprefix("(").partition(")")[0] == " + ".join(members)
+        sort = "their sum" if plain else "one combination"
         return f"{few} {'is' if len(members) == 1 else 'are'} determined only as {sort}: {known_text(seen[0])}."
     shown = "; ".join(known_text(one) for one in seen[:8]) + ("; .." if len(seen) > 8 else "")
     return f"{few} ({len(members)}) are determined only through {len(seen)} combinations: {shown}."
-
-
-def _coefficients(one: Combination) -> str:
-    """Coefficients of the names in a sum."""
-    inner = one.words.partition(")")[0].removeprefix("(") if one.words.startswith("(") else one.words
-    return "".join(term.strip().rpartition(" ")[0] for term in inner.split(" + "))
 
 
 def _upper(text: str) -> str:
@@ -109,7 +95,7 @@ def kinds(exponents: np.ndarray, information: Information, of: float) -> list[st
         if len(names) == 1:
             said.append(names[0])
             continue
-        plural = "sensor sensitivities" if kind == "sensor" else _KINDS.get(kind, ("", f"parameters in {kind}"))[1]
+        plural = _KINDS.get(kind, f"parameters in {kind}")
         said.append(plural + (f" ({', '.join(names)})" if len(names) <= 3 else ""))
     return said
 
@@ -117,34 +103,24 @@ def kinds(exponents: np.ndarray, information: Information, of: float) -> list[st
 def scaling_sentence(scaling: Scaling, information: Information) -> str:
     """A common factor that changes no response, and the parameter that fixes it."""
     sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
+    members = [listed(kinds(scaling.exponents, information, size)) for size in sizes]
     if sizes == [1.0]:
-        return (
-            f"{_upper(listed(kinds(scaling.exponents, information, 1.0)))} are determined only as ratios: a common "
-            f"factor of all of them changes no response. If {information.names[scaling.pin]} is known, the factor "
-            "is known."
-        )
-    if sizes == [1.0, -1.0]:
-        up, down = (kinds(scaling.exponents, information, sign) for sign in (1.0, -1.0))
-        return (
-            f"{_upper(listed(up))} and {listed(down)} are determined only as products: larger {listed(up)} with "
-            f"smaller {listed(down)} change no response. If {information.names[scaling.pin]} is known, the factor "
-            "is known."
-        )
-    parts = [
-        f"{listed(kinds(scaling.exponents, information, size))} by the factor"
-        + (f" to the power {size:g}" if size != 1 else "")
-        for size in sizes
-    ]
-    return (
-        f"Multiplying {'; '.join(parts)} changes no response. If {information.names[scaling.pin]} is known, the "
-        "factor is known."
-    )
+        said = f"{_upper(members[0])} are determined only as ratios: a common factor of all of them changes no response"
+    elif sizes == [1.0, -1.0]:
+        up, down = members
+        products = f"{_upper(up)} and {down} are determined only as products"
+        said = f"{products}: larger {up} with smaller {down} change no response"
+    else:
+        powers = ("" if size == 1 else f" to the power {size:g}" for size in sizes)
+        parts = "; ".join(f"{some} by the factor{power}" for some, power in zip(members, powers, strict=True))
+        said = f"Multiplying {parts} changes no response"
+    return f"{said}. If {information.names[scaling.pin]} is known, the factor is known."
 
 
 def weak_sentence(one: Combination) -> str:
     """Precision of a combination that is determined poorly."""
     return (
-        f"{one.words} is determined only to {number(100 * one.relative)} %: "
+        f"{one.words} is determined only to {100 * one.relative:.3g} %: "
         f"{uncertain_value.text(one.value, one.standard_deviation, one.unit)}."
     )
 

@@ -7,10 +7,10 @@ z are standardised parameters; the transients of the records are projected out o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -193,16 +193,18 @@ class _Expansion:
         return self.cost + float(self.z @ self.z)
 
 
-class _Expand(Protocol):
-    def __call__(self, z: np.ndarray, derivative: bool = True) -> _Expansion:
-        """Expansion at z; without derivative only the sum of squares. Raises InputError if no rig has these values."""
-
-
 def descent(
-    expand: _Expand, z: np.ndarray, priors: Priors, iterations: int, settings: FitSettings
+    expand: Callable[[np.ndarray, bool], _Expansion],
+    z: np.ndarray,
+    priors: Priors,
+    iterations: int,
+    settings: FitSettings,
 ) -> tuple[_Expansion, int]:
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and the number of
     steps.
+
+    expand : expansion at z, and whether with the derivative; without it, only the sum of squares is needed. Raises
+        InputError if no rig has these values.
 
     All parameters stay within their bounds; with a parameter at its bound, the remaining ones still reach their
     optimum.
@@ -212,7 +214,7 @@ def descent(
     Shortening the step as a whole hardly corrects this, and leads to ever shorter steps.
     """
     needed, bounds = 0.0, priors.bounds
-    at = expand(np.clip(z, *bounds))
+    at = expand(np.clip(z, *bounds), True)
     for steps in range(iterations):
         undamped = _bounded_step(at, 0.0, bounds)
         if (undamped - at.z) @ (at.g - at.z) < settings.converged * len(at.now.e):
@@ -221,8 +223,8 @@ def descent(
             z = _bounded_step(at, damping, bounds) if damping else undamped
             try:
                 # For a step that may be rejected, the derivative is not needed yet.
-                if not (damping or needed) or expand(z, derivative=False).whole < at.whole:
-                    after = expand(z)
+                if not (damping or needed) or expand(z, False).whole < at.whole:
+                    after = expand(z, True)
                     if after.whole < at.whole:
                         at, needed = after, damping
                         break
@@ -276,9 +278,7 @@ def fit(
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
-        def expand(
-            z: np.ndarray, derivative: bool = True, model: Any = model, weights: Weights = weights
-        ) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool, model: Any = model, weights: Weights = weights) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, data, weights, derivative)
             return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
@@ -378,7 +378,7 @@ class Profile:
         rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
 
-        def expand(z: np.ndarray, derivative: bool = True) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool) -> _Expansion:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights, derivative)
             # The products of the rows that `free` would return.

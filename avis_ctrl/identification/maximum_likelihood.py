@@ -22,7 +22,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -61,13 +61,16 @@ SETTINGS = LikelihoodSettings()
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Residual of a block: error e (n, n_y, m), white (the same with unit variance E|e|^2), and transient (n,
-    n_y, m)."""
+    """Residual of a block.
+
+    plain : (n, n_y, m) Y - G U. error : the same without the transient of the record's ends.
+    white : (n, n_y, m) the error whitened, E|white|^2 = 1 if it is noise only.
+    """
 
     block: SpectralBlock
+    plain: np.ndarray
     error: np.ndarray
     white: np.ndarray
-    transient: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +83,13 @@ class LikelihoodFit(Generic[Fitted]):
     information : of the estimate (inverse of the Cramer-Rao bound), reduced by the cost of estimated weights.
     chi2, dof : sum of squares that should be standard normal, including priors, and its degrees of freedom: the
         transients' unknowns and the determined combinations of parameters are subtracted.
-    iterations, converged : of the best start. history : chi2 after each of its steps.
+    iterations, converged : of the best start.
     residuals : one per block.
     starts : chi2 reached from each start, infinite if it failed.
-    priors : used, by name. held : parameters that ended at their smallest physical value, and moments of inertia that
-        ended at their largest; for these, and for parameters correlated with them, the information describes a normal
-        distribution that is truncated there.
+    priors : parameters that have one.
+    held : parameters that ended at their smallest physical value, and moments of inertia that ended at their largest;
+        for these, and for parameters correlated with them, the information describes a normal distribution that is
+        truncated there.
     """
 
     model: Fitted
@@ -94,10 +98,9 @@ class LikelihoodFit(Generic[Fitted]):
     dof: int
     iterations: int
     converged: bool
-    history: tuple[float, ...]
     residuals: tuple[Residual, ...]
     starts: tuple[float, ...]
-    priors: Mapping[str, Prior] = field(default_factory=dict)
+    priors: tuple[str, ...] = ()
     held: tuple[str, ...] = ()
 
     @property
@@ -158,7 +161,11 @@ def fit(
         begin = model if k == 0 else _moved(model, spread, rng)
         if begin is not None:
             if k > 0:
-                begin = _thinned_descent(begin, blocks, priors, about, max_iterations)
+                # A first descent on some of the lines leads from a distant start to the same minimum in less time.
+                few = [thinned(b, max(SETTINGS.thin_lines, len(b.omega) // SETTINGS.thin_by)) for b in blocks]
+                first = _Descent(begin, few, [whitener(block) for block in few], priors, about)
+                first.run(max_iterations)
+                begin = first.model
             descent = _Descent(begin, blocks, whiteners, priors, about)
             descent.run(max_iterations)
             reached.append((descent.now.chi2, descent))
@@ -186,22 +193,11 @@ def fit(
         dof,
         best.iterations,
         best.converged,
-        tuple(best.history),
         last.residuals,
         tuple(value for value, _ in reached),
-        priors,
-        tuple(name for name, low in zip(model.names, best.at_bound(), strict=True) if low) + best.largest_moments(),
+        tuple(priors),
+        tuple(name for name, low in zip(model.names, best.at_bounds()[0], strict=True) if low) + best.largest_moments(),
     )
-
-
-def _thinned_descent(
-    begin: Fitted, blocks: Sequence[SpectralBlock], priors: Mapping[str, Prior], first: Fitted, max_iterations: int
-) -> Fitted:
-    """A first descent on a subset of the lines: from a distant start it leads to the same minimum in less time."""
-    few = [thinned(block, max(SETTINGS.thin_lines, len(block.omega) // SETTINGS.thin_by)) for block in blocks]
-    descent = _Descent(begin, few, [whitener(block) for block in few], priors, first)
-    descent.run(max_iterations)
-    return descent.model
 
 
 class _Descent(Generic[Fitted]):
@@ -219,7 +215,6 @@ class _Descent(Generic[Fitted]):
         self.scale, (self.lowest, self.highest) = first.scales(), first.bounds()
         self.rows = _held_rows(first)
         self.now = self.evaluate(model)
-        self.history = [self.now.chi2]
         self.iterations, self.converged = 0, False
 
     def evaluate(self, model: Fitted, derivative: bool = True, residuals: bool = False) -> _Quadratic:
@@ -267,7 +262,6 @@ class _Descent(Generic[Fitted]):
                 gain = (self.now.chi2 - trial[1]) / promised
                 self.model, self.iterations = trial[0], self.iterations + 1
                 self.now = self.evaluate(self.model)
-                self.history.append(self.now.chi2)
                 damping = max(damping * (0.1 if gain > 0.5 else 1.0), 1e-12)
             else:
                 damping *= 10
@@ -281,7 +275,8 @@ class _Descent(Generic[Fitted]):
 
         The step runs along the bounds and edges that it would otherwise cross.
         """
-        free = ~((self.at_bound() & (self.now.gradient > 0)) | (self.at_top() & (self.now.gradient < 0)))
+        low, high = self.at_bounds()
+        free = ~((low & (self.now.gradient > 0)) | (high & (self.now.gradient < 0)))
         basis = np.eye(len(free))[:, free]
         step, promised = self._step_in(basis, damping)
         rows, edge, held = self.rows * self.scale, self.at_edge(), np.zeros(len(self.rows), bool)
@@ -326,13 +321,10 @@ class _Descent(Generic[Fitted]):
         """Names of the moments of inertia at the largest value that a rigid body can have."""
         return tuple(self.model.names[int(np.argmin(row))] for row in self.rows[self.at_edge()])
 
-    def at_bound(self) -> np.ndarray:
-        """(n_p,) which parameters are at their smallest physical value."""
-        return self.model.values <= self.lowest + _slack(self.lowest)
-
-    def at_top(self) -> np.ndarray:
-        """(n_p,) which parameters are at their largest value."""
-        return self.model.values >= self.highest - _slack(self.highest)
+    def at_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n_p,) each: which parameters are at their smallest and at their largest physical value."""
+        low, high = (1e-9 * np.nan_to_num(np.abs(one), posinf=0.0) for one in (self.lowest, self.highest))
+        return self.model.values <= self.lowest + low, self.model.values >= self.highest - high
 
     def _try(self, step: np.ndarray) -> tuple[Fitted, float] | None:
         values = np.clip(self.model.values + step * self.scale, self.lowest, self.highest)
@@ -354,11 +346,6 @@ class _Descent(Generic[Fitted]):
         return (model, chi2) if np.isfinite(chi2) else None
 
 
-def _slack(bound: np.ndarray) -> np.ndarray:
-    """(n_p,) distance at which a parameter counts as being at its bound."""
-    return 1e-9 * np.abs(bound, where=np.isfinite(bound), out=np.zeros(len(bound)))
-
-
 def _physical(model: FrequencyModel) -> bool:
     """Whether stiffness, damping and sensitivities have the sign that they have on a real rig."""
     return all(value > 0 for name, value in zip(model.names, model.values, strict=True) if positive(name))
@@ -374,22 +361,28 @@ def block_residual(
         error = block.Y - found.Y
         white = whitened(L, error)
         J = whitened_real(L, found.dY) if derivative else np.empty(0)
-        return as_real(white[None])[0], J, Residual(block, error, white / np.sqrt(2), np.zeros_like(error))
-    columns, norms = transient_columns(block, model)
+        return as_real(white[None])[0], J, Residual(block, error, error, white / np.sqrt(2))
+    columns, norms, Q, X = whitened_transient(model, block, L)
     plain = block.Y - model.answer(block, None, False).Y
-    T = as_real(np.moveaxis(whitened(L, columns), -1, 0))
-    Q, X = span(T.T)
     e = as_real(whitened(L, plain)[None])[0]
     x = X @ (Q.T @ e)
-    transient = (columns @ x)[:, :, None]
-    white = whitened(L, plain - transient)
+    error = plain - (columns @ x)[:, :, None]
+    white = whitened(L, error)
     e = as_real(white[None])[0]
     J = np.empty(0)
     if derivative:
         body, inner = transient_parts(x, norms, block, model)
         J = whitened_real(L, model.answer(block, body, inner=inner).dY)
         J -= (Q @ (Q.T @ J.T)).T  # parameters come last in memory
-    return e, J, Residual(block, plain - transient, white / np.sqrt(2), transient)
+    return e, J, Residual(block, plain, error, white / np.sqrt(2))
+
+
+def whitened_transient(
+    model: FrequencyModel, block: SpectralBlock, L: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`transient_columns` of a block with their norms, and `span` Q (N, r), X (n_t, r) of the whitened columns."""
+    columns, norms = transient_columns(model, block.omega)
+    return columns, norms, *span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
 
 
 def added_terms(
@@ -410,8 +403,7 @@ def added_terms(
         e, J, _ = block_residual(model, block, L, derivative=True)
         c = as_real(whitened(L, of))
         if block.transient:
-            T = as_real(np.moveaxis(whitened(L, transient_columns(block, model)[0]), -1, 0))
-            Q, _ = span(T.T)
+            Q = whitened_transient(model, block, L)[2]
             c = c - (c @ Q) @ Q.T
         rows = np.concatenate([J * scale[:, None], c])
         H += rows @ rows.T
@@ -485,7 +477,7 @@ def as_real(white: np.ndarray) -> np.ndarray:
 
 def transient_unknowns(block: SpectralBlock, model: FrequencyModel) -> int:
     """Number of unknowns in the transient of a block."""
-    return len(transient_columns(block.lines(np.arange(1)), model)[1]) if block.transient else 0
+    return len(transient_columns(model, block.omega[:1])[1]) if block.transient else 0
 
 
 def _moved(model: Fitted, spread: float, rng: np.random.Generator) -> Fitted | None:

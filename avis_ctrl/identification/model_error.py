@@ -9,6 +9,7 @@ frequency, as the local polynomial requires.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -60,13 +61,9 @@ class Unexplained(RecordSource):
             self.predictor, self.at = Predictor(self.model, large_motion=True), 0
         piece = self.record.load(self.at, stop)
         read = self.predictor.read(*model_inputs(self.model, piece))
-        keep, self.at = slice(start - self.at, None), stop
-        y = piece.y.copy()
+        y, before, self.at = piece.y.copy(), start - self.at, stop
         y[:, self.columns] -= read
-        header = replace(
-            piece.header, samples=stop - start, start_s=self.header.start_s + start / self.header.sample_rate_Hz
-        )
-        return Record(header, piece.u[keep], y[keep], None if piece.floor is None else piece.floor[keep])
+        return replace(piece, y=y).load(before)
 
 
 def unexplained(campaign: Campaign, model: ResponseModel) -> Campaign:
@@ -103,18 +100,10 @@ def _local(
 ) -> FrequencyResponse:
     # Directions that the records do not excite at all are missing in windows of any width.
     widths = SETTINGS.half_widths if excited_space(campaign, band_Hz).full else SETTINGS.half_widths[:1]
+    local = partial(local_polynomial, campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, longest_piece=longest_piece)
     for half_width in widths:
         try:
-            return local_polynomial(
-                campaign, band_Hz=band_Hz, frequency_Hz=frequency_Hz, half_width=half_width, longest_piece=longest_piece
-            )
+            return local(half_width=half_width)
         except ComputationError:
             continue
-    return local_polynomial(
-        campaign,
-        band_Hz=band_Hz,
-        frequency_Hz=frequency_Hz,
-        half_width=widths[-1],
-        longest_piece=longest_piece,
-        partial=True,
-    )
+    return local(half_width=widths[-1], partial=True)

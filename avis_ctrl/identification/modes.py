@@ -52,37 +52,33 @@ SETTINGS = ModeSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class ModelModes:
-    """frequency_Hz (undamped), damping : (n,), ascending; covariance : (2 n, 2 n) of frequencies, then dampings.
-
-    shapes : (6, n) complex. words : each shape by its coordinates' fractions of the kinetic energy.
-    """
+class Modes:
+    """frequency_Hz (undamped), damping : (n,), ascending; covariance : (2 n, 2 n) of frequencies, then dampings."""
 
     frequency_Hz: np.ndarray
     damping: np.ndarray
     covariance: np.ndarray
-    shapes: np.ndarray
-    words: tuple[str, ...]
 
     @property
-    def frequency_std_Hz(self) -> np.ndarray:
-        """(n,) standard deviations of the frequencies."""
-        return np.sqrt(np.diag(self.covariance)[: len(self.damping)])
-
-    @property
-    def damping_std(self) -> np.ndarray:
-        """(n,) standard deviations of the damping ratios."""
-        return np.sqrt(np.diag(self.covariance)[len(self.damping) :])
+    def columns(self) -> tuple[np.ndarray, ...]:
+        """(n,) each: frequencies and their standard deviations, damping ratios and theirs."""
+        std = np.split(np.sqrt(np.diag(self.covariance)), 2)
+        return self.frequency_Hz, std[0], self.damping, std[1]
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredModes:
-    """As `ModelModes`, for the poles of the data alone; misfit : mean square of the whitened residual, 1 if the poles
-    explain all but the noise (standard deviations are multiplied by its root if it is larger)."""
+class ModelModes(Modes):
+    """shapes : (6, n) complex. words : each shape by its coordinates' fractions of the kinetic energy."""
 
-    frequency_Hz: np.ndarray
-    damping: np.ndarray
-    covariance: np.ndarray
+    shapes: np.ndarray
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredModes(Modes):
+    """The poles of the data alone; misfit : mean square of the whitened residual, 1 if the poles explain all but the
+    noise (standard deviations are multiplied by its root if it is larger)."""
+
     misfit: float
     lines: int
     band_Hz: tuple[float, float]
@@ -162,25 +158,10 @@ def mode_table(
     n = len(found.damping)
     beside = [np.full(n, np.nan)] * 6
     if measured is not None:
-        own = np.sqrt(np.diag(measured.covariance))
         total = np.sqrt(np.diag(found.covariance) + np.diag(measured.covariance))
-        beside = [
-            measured.frequency_Hz,
-            own[:n],
-            measured.damping,
-            own[n:],
-            (found.frequency_Hz - measured.frequency_Hz) / total[:n],
-            (found.damping - measured.damping) / total[n:],
-        ]
-    columns = [
-        found.frequency_Hz,
-        found.frequency_std_Hz,
-        found.damping,
-        found.damping_std,
-        before.frequency_Hz,
-        before.damping,
-        *beside,
-    ]
+        frequency, damping = found.frequency_Hz - measured.frequency_Hz, found.damping - measured.damping
+        beside = [*measured.columns, frequency / total[:n], damping / total[n:]]
+    columns = [*found.columns, before.frequency_Hz, before.damping, *beside]
     return tuple(ModeRow(shape, *map(float, row)) for shape, *row in zip(found.words, *columns, strict=True))
 
 

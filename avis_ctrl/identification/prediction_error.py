@@ -13,30 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.identification.maximum_likelihood import as_real, block_residual, whitened, whitener
+from avis_ctrl.identification.maximum_likelihood import Residual, block_residual, whitened_transient, whitener
 from avis_ctrl.identification.response import FrequencyModel
-from avis_ctrl.identification.spectra import span, transient_columns
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 
 @dataclass(frozen=True, eq=False)
-class PredictionError:
-    """Prediction error of one block.
+class PredictionError(Residual):
+    """Prediction error of one block, with the noise that it is compared with.
 
     Attributes
     ----------
-    block : with the noise that the error is compared with.
-    plain : (n, n_y, m) Y - G U. error : the same without the transient of the record's ends.
-    white : (n, n_y, m) the error whitened, E|white|^2 = 1 if it is noise only.
     derivative : (n_p, n, n_y, m) of the whitened model output by the parameters, transients projected out; unit as
         `white`. Empty if not requested.
     dof : real degrees of freedom of the error. output_dof : (n_y,) of each output's own error.
     """
 
-    block: SpectralBlock
-    plain: np.ndarray
-    error: np.ndarray
-    white: np.ndarray
     derivative: np.ndarray
     dof: int
     output_dof: np.ndarray
@@ -82,13 +74,10 @@ def prediction_error(model: FrequencyModel, block: SpectralBlock, derivative: bo
     _, J, left = block_residual(model, block, L, derivative=derivative)
     lost, rank = np.zeros(n_y), 0
     if block.transient:
-        columns, _ = transient_columns(block, model)
-        basis, _ = span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
+        basis = whitened_transient(model, block, L)[2]
         rank, lost = basis.shape[1], _lost(L, basis, block)
     slopes = _complex(J, (n, n_y, m)) / np.sqrt(2) if derivative else np.empty((0, n, n_y, m), complex)
-    return PredictionError(
-        block, left.error + left.transient, left.error, left.white, slopes, 2 * n * n_y * m - rank, 2 * n * m - lost
-    )
+    return PredictionError(block, left.plain, left.error, left.white, slopes, 2 * n * n_y * m - rank, 2 * n * m - lost)
 
 
 def _lost(L: np.ndarray, basis: np.ndarray, block: SpectralBlock) -> np.ndarray:

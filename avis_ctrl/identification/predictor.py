@@ -19,6 +19,7 @@ from avis_ctrl.checks import places
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.large_motion import SteppedTable, sensors_of, step_through, step_through_linear
 from avis_ctrl.identification.response import FLOOR, ResponseModel
+from avis_ctrl.identification.sample_and_hold import whole_samples
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.rigs.nonlinear import rig_arrays
 
@@ -117,10 +118,7 @@ class Predictor:
         if not model.period_s:
             raise InputError("expected a model with a sample time", field="period_s", value=model.period_s)
         self.model, self.system = model, continuous(model, large_motion)
-        whole, part = divmod(model.delay_s / model.period_s, 1.0)
-        if part > 1 - 1e-9:
-            whole, part = whole + 1, 0.0
-        self.whole = int(whole)
+        self.whole, part = whole_samples(model.delay_s, model.period_s)
         early, late = self._step(part), self._step(1 - part)
         n_u = len(model.actuators)
         self.Phi = late[0] @ early[0]

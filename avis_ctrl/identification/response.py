@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, wraps
-from itertools import zip_longest
 from typing import NamedTuple, Protocol, Self, TypeVar
 from weakref import ref
 
@@ -118,20 +117,16 @@ class SensorModel:
     assumed: tuple[tuple[float, float] | None, ...] = ()
     low_pass: tuple[complex, ...] = ()
 
-    def _detuned(self, s: np.ndarray, k: int) -> np.ndarray | float:
-        """Factor on the response of a geophone whose suspension differs from the one that its filter assumes."""
-        known, own = (one[k] if one else None for one in (self.assumed, self.suspensions))
-        if known is None or own is None or known == own:
-            return 1.0
-        (f0, z0), (f, z) = known, own
-        w0, w = 2 * np.pi * f0, 2 * np.pi * f
-        return (s**2 + 2 * z0 * w0 * s + w0**2) / (s**2 + 2 * z * w * s + w**2)
+    @property
+    def _mismatches(self) -> dict[int, tuple[tuple[float, float], tuple[float, float]]]:
+        """Suspension as assumed and actual of the geophones whose filters do not match them, by index."""
+        pairs = enumerate(zip(self.assumed, self.suspensions, strict=False))
+        return {k: (known, own) for k, (known, own) in pairs if known and own and known != own}
 
     @property
     def detuned(self) -> dict[str, tuple[float, float]]:
         """Corner [Hz] and damping ratio of the geophones whose filters do not match them."""
-        known = zip(self.names, self.suspensions, self.assumed, strict=False)
-        return {name: own for name, own, assumed in known if own is not None and own != assumed}
+        return {self.names[k]: own for k, (_, own) in self._mismatches.items()}
 
     def suspension_slopes(self, s: np.ndarray, k: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """(n, len(k)) each: relative change of the response of some geophones per Hz of the corner, and per unit of the
@@ -144,11 +139,10 @@ class SensorModel:
     @property
     def realised(self) -> SensorModel:
         """The same sensors, with every suspension that its filter does not match included in the sensor's chain."""
-        chains = []
-        for chain, known, own in zip_longest(self.chains, self.assumed, self.suspensions):
-            if chain is not None and known and own and known != own:
-                chain = cascade(second_order_roots(*known), second_order_roots(*own), 1.0) @ chain
-            chains.append(chain)
+        chains = list(self.chains)
+        for k, (known, own) in self._mismatches.items():
+            if (chain := chains[k]) is not None:
+                chains[k] = cascade(second_order_roots(*known), second_order_roots(*own), 1.0) @ chain
         return replace(self, chains=tuple(chains), assumed=self.suspensions)
 
     def picked(self, index: Sequence[int]) -> SensorModel:
@@ -174,37 +168,22 @@ class SensorModel:
         """Whether all sensors measure one kind of motion, in space, with one chain."""
         return len({*zip(self.motions, map(id, self.chains), strict=True)}) == 1 and not np.any(self.relative)
 
-    def _common(self) -> int:
+    @property
+    def common(self) -> tuple[Motion, StateSpace | None, tuple[float, ...]]:
+        """Motion, chain and poles of all sensors. Raises InputError if they differ."""
         if not self.alike:
             raise InputError("expected sensors of one kind, with one chain", field="sensors", value=list(self.motions))
-        return 0
-
-    @property
-    def motion(self) -> Motion:
-        """Motion that all sensors measure. Raises InputError if they differ."""
-        return self.motions[self._common()]
-
-    @property
-    def chain(self) -> StateSpace | None:
-        """Chain of all sensors. Raises InputError if they differ."""
-        return self.chains[self._common()]
-
-    @property
-    def transient_poles(self) -> tuple[float, ...]:
-        """Denominator coefficients of all sensors. Raises InputError if they differ."""
-        return self.poles[self._common()]
+        return self.motions[0], self.chains[0], self.poles[0]
 
     def sense(self, omega: np.ndarray) -> np.ndarray:
         """(n, n_y) response from displacement to y of unit sensitivity."""
         s = 1j * np.asarray(omega, float)
         lines = s.imag.tobytes()
-        return np.stack(
-            [
-                _chain_response(chain, motion, lines) * self._detuned(s, k)
-                for k, (chain, motion) in enumerate(zip(self.chains, self.motions, strict=True))
-            ],
-            axis=1,
-        )
+        found = [_chain_response(*one, lines) for one in zip(self.chains, self.motions, strict=True)]
+        for k, ((f0, z0), (f, z)) in self._mismatches.items():
+            w0, w = 2 * np.pi * f0, 2 * np.pi * f
+            found[k] = found[k] * ((s**2 + 2 * z0 * w0 * s + w0**2) / (s**2 + 2 * z * w * s + w**2))
+        return np.stack(found, axis=1)
 
     def driven(
         self, omega: np.ndarray, period_s: float, delay_s: float, corner_Hz: float | None

@@ -38,11 +38,15 @@ def hold(omega: np.ndarray, period_s: float, delay_s: float = 0.0) -> np.ndarray
     return np.sinc(half / np.pi) * np.exp(-1j * omega * (period_s / 2 + delay_s))
 
 
+def whole_samples(delay_s: float, period_s: float) -> tuple[int, float]:
+    """A delay in whole samples and the remaining fraction of a sample."""
+    whole, part = divmod(delay_s / period_s, 1.0)
+    return (int(whole), part) if part <= 1 - 1e-9 else (int(whole) + 1, 0.0)
+
+
 def sampled_pole(omega: np.ndarray, period_s: float, delay_s: float, pole: complex) -> np.ndarray:
     """Exact sampled response, (n,), of 1/(s - pole) after hold and delay (modified z-transform); real part <= 0."""
-    whole, part = divmod(delay_s / period_s, 1.0)
-    if part > 1 - 1e-9:  # a whole number of samples, rounded down
-        whole, part = whole + 1, 0.0
+    whole, part = whole_samples(delay_s, period_s)
     z = np.exp(1j * np.asarray(omega, float) * period_s)
 
     def integral(low: float, high: float) -> complex:

@@ -85,12 +85,8 @@ def response_block(
     ------
     InputError : channels or units that are not the model's, a Gram matrix with negative eigenvalues.
     """
-    if measured.output_unit != model.sensors.unit:
-        raise InputError(
-            f"expected {model.sensors.unit}", field="unit of the response's outputs", value=measured.output_unit
-        )
     n, n_in = len(measured.frequency_Hz), len(measured.inputs)
-    rows = places(model.sensors.names, measured.outputs, "the response has", "outputs")
+    rows = sensor_rows(measured, model)
     if measured.entry_variance is None:
         assert measured.gram is not None and measured.noise is not None
         W = _root(measured.gram)
@@ -111,6 +107,15 @@ def response_block(
         kind=name,
         shared=measured.shared,
     )
+
+
+def sensor_rows(measured: FrequencyResponse, model: ResponseModel) -> list[int]:
+    """Rows of the model's sensors in a measured response. Raises InputError for another unit and missing sensors."""
+    if measured.output_unit != model.sensors.unit:
+        raise InputError(
+            f"expected {model.sensors.unit}", field="unit of the response's outputs", value=measured.output_unit
+        )
+    return places(model.sensors.names, measured.outputs, "the response has", "outputs")
 
 
 def _root(gram: np.ndarray) -> np.ndarray:
@@ -139,18 +144,14 @@ def _place(
     into[:, [offset + k for k in places(names, known, "the model's inputs are", field)]] = values
 
 
-def transient_columns(block: SpectralBlock, model: FrequencyModel) -> tuple[np.ndarray, np.ndarray]:
+@kept_lines
+def transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(n, n_y, n_t) columns, for real coefficients, of the transient of a record's ends in its spectra; (n_t,) norms.
 
     Impulse and step on the body (12), the states of the sensors' chains (`ResponseModel.sensor_transients`), and last
     the inner states of a model other than the body's. The columns have unit norm; each was divided by its original
     norm.
     """
-    return _transient_columns(model, block.omega)
-
-
-@kept_lines
-def _transient_columns(model: FrequencyModel, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     n, n_in = len(omega), len(model.inputs)
     U = np.zeros((n, n_in + 2 * N_Q, 2 * N_Q), complex)
     U[:, n_in:] = np.eye(2 * N_Q)

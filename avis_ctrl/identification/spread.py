@@ -22,6 +22,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import sensor_rows
 from avis_ctrl.lti.norms import largest_singular_value
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.response import SETTINGS as SPAN
@@ -122,7 +123,6 @@ def frf_spread(
     model: ResponseModel,
     keep: Sequence[str] = ("z", "phi_x"),
     confidences: Sequence[float] = SETTINGS.confidences,
-    seed: int = 1,
 ) -> FrfSpread:
     """Spread of a measured frequency response about an identified model.
 
@@ -142,29 +142,38 @@ def frf_spread(
     """
     if not confidences or not all(0 < one < 1 for one in confidences):
         raise InputError("expected probabilities between 0 and 1", field="confidences", value=list(confidences))
-    rows, drives = _channels(measured, model)
+    rows = sensor_rows(measured, model)
+    drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
+    if not drives:
+        raise InputError(
+            f"expected a response to some of {', '.join(model.actuators)}", field="inputs", value=list(measured.inputs)
+        )
     A, D = kept_axes(model.rig, keep, model.actuators, model.sensors.names)
     D = D / model.sensors.sensitivity
-    measured, A = _pushed(measured, model, A, keep)
     columns = [measured.inputs.index(model.actuators[k]) for k in drives]
+    measured, A = _pushed(measured, model, A, keep, drives, columns)
     response = model.response(measured.omega)[:, :, drives]
     G_k = D @ response @ A
     L = np.linalg.solve(G_k, D @ (measured.value[:, rows][:, :, columns] - response) @ A)
     left = np.linalg.solve(G_k, np.broadcast_to(D, (len(G_k), *D.shape)))
-    noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences, seed)
+    noise = _noise_quantile(_covariance(measured, rows, columns, left, A), len(keep), measured.dof, confidences)
     return FrfSpread(tuple(keep), measured.frequency_Hz, largest_singular_value(L), noise, tuple(confidences))
 
 
 def _pushed(
-    measured: FrequencyResponse, model: ResponseModel, A: np.ndarray, keep: Sequence[str]
+    measured: FrequencyResponse,
+    model: ResponseModel,
+    A: np.ndarray,
+    keep: Sequence[str],
+    drives: Sequence[int],
+    at: Sequence[int],
 ) -> tuple[FrequencyResponse, np.ndarray]:
-    """Lines on which the response to the kept coordinates is known, and A (n_u, k) for the measured drives.
+    """Lines on which the response to the kept coordinates is known, and A (n_u, k) for the measured drives, which are
+    the inputs `at` of the response.
 
     This is A as a design has it, in the order of those drives, if the records excite it; otherwise the minimum-norm
     combination of the played voltages that gives the same forces.
     """
-    drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
-    at = [measured.inputs.index(model.actuators[k]) for k in drives]
 
     def known(volts: np.ndarray) -> np.ndarray:
         V = np.zeros((len(measured.inputs), volts.shape[1]))
@@ -195,28 +204,7 @@ def _played(measured: FrequencyResponse, at: Sequence[int]) -> np.ndarray:
     _, inside = measured.inverse_gram()
     line = int(np.argmax(np.real(np.trace(inside, axis1=1, axis2=2))))
     left, s, _ = np.linalg.svd(measured.gram[line][np.ix_(at, at)].real)
-    known = left[:, s > SPAN.outside**2 * s[0]]
-    return known
-
-
-def _channels(measured: FrequencyResponse, model: ResponseModel) -> tuple[list[int], list[int]]:
-    """Rows of the model's sensors in the response, and indices of the model's actuators that it contains."""
-    if measured.output_unit != model.sensors.unit:
-        raise InputError(
-            f"expected {model.sensors.unit}", field="unit of the response's outputs", value=measured.output_unit
-        )
-    if missing := [name for name in model.sensors.names if name not in measured.outputs]:
-        raise InputError(
-            f"expected a response with {', '.join(model.sensors.names)}; {', '.join(missing)} missing",
-            field="outputs",
-            value=list(measured.outputs),
-        )
-    drives = [k for k, name in enumerate(model.actuators) if name in measured.inputs]
-    if not drives:
-        raise InputError(
-            f"expected a response to some of {', '.join(model.actuators)}", field="inputs", value=list(measured.inputs)
-        )
-    return [measured.outputs.index(name) for name in model.sensors.names], drives
+    return np.asarray(left[:, s > SPAN.outside**2 * s[0]])
 
 
 def _covariance(
@@ -237,9 +225,9 @@ def _covariance(
     return found.reshape(n, k * k, k * k)
 
 
-def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float], seed: int) -> np.ndarray:
+def _noise_quantile(covariance: np.ndarray, k: int, dof: float, confidences: Sequence[float]) -> np.ndarray:
     """(c, n) quantiles of the largest singular value of (k, k) matrices of that covariance, estimated with `dof`."""
-    rng, draws, chunk = np.random.default_rng(seed), SETTINGS.draws, SETTINGS.chunk
+    rng, draws, chunk = np.random.default_rng(1), SETTINGS.draws, SETTINGS.chunk
     Z = (rng.standard_normal((draws, k * k)) + 1j * rng.standard_normal((draws, k * k))) / np.sqrt(2)
     if np.isfinite(dof):
         # The covariance was estimated: the ratio has an F instead of a chi-square distribution.

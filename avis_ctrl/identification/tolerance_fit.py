@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
+from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit
 from avis_ctrl.identification.maximum_likelihood import (
@@ -23,7 +23,7 @@ from avis_ctrl.identification.maximum_likelihood import (
     transient_unknowns,
     whitener,
 )
-from avis_ctrl.identification.priors import Priors, beside, identified
+from avis_ctrl.identification.priors import beside, identified
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.rigs.avis import AvisTable
@@ -44,7 +44,6 @@ def begin(
     levels: Mapping[str, float],
     tolerances: Tolerances,
     stated: Mapping[str, Prior],
-    settings: FitSettings = SETTINGS,
 ) -> ToleranceFit:
     """Start from parameters that were fitted with the file's values as stated, on some lines of each block.
 
@@ -55,31 +54,26 @@ def begin(
     """
     assert isinstance(model.rig, AvisTable)  # each channel at its own position
     rig = model.rig.with_channels_apart()
-    rest = beside(replace(model, rig=rig, names=()), model.names, tolerances, settings)
-    priors = identified(model, stated, settings).followed_by(rest)
+    rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
+    priors = identified(model, stated).followed_by(rest)
     apart = replace(model, rig=rig, names=priors.names)
-    data = Data.of(blocks, levels, settings.lines)
+    data = Data.of(blocks, levels, SETTINGS.lines)
     flat = np.array([name in model.names and name not in stated for name in priors.names])
-    found = fit(apart, priors, priors.z(apart.values), data, first_variances(data, settings), settings)
+    found = fit(apart, priors, priors.z(apart.values), data, first_variances(data, SETTINGS))
     return ToleranceFit(found, flat)
 
 
-def end(
-    begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float], settings: FitSettings = SETTINGS
-) -> ToleranceFit:
+def end(begun: ToleranceFit, blocks: Sequence[SpectralBlock], levels: Mapping[str, float]) -> ToleranceFit:
     """Continue from there, with blocks from which the second-order terms of the fitted model were subtracted."""
-    one, data = begun.fitted, Data.of(blocks, levels, settings.lines)
+    one, data = begun.fitted, Data.of(blocks, levels, SETTINGS.lines)
     priors = replace(one.priors, mean=np.where(begun.flat, one.priors.values(one.z), one.priors.mean))
-    rounds = replace(settings, rounds=settings.final_rounds)
+    rounds = replace(SETTINGS, rounds=SETTINGS.final_rounds)
     found = fit(one.model, priors, np.where(begun.flat, 0.0, one.z), data, one.variances, rounds)
     return begun._replace(fitted=found)
 
 
 def as_likelihood_fit(
-    found: ToleranceFit,
-    blocks: Sequence[SpectralBlock],
-    first: LikelihoodFit[ResponseModel],
-    settings: FitSettings = SETTINGS,
+    found: ToleranceFit, blocks: Sequence[SpectralBlock], first: LikelihoodFit[ResponseModel]
 ) -> LikelihoodFit[ResponseModel]:
     """Convert to the form of a fit by noise alone, with tolerances among the parameters; residuals on all lines of the
     blocks."""
@@ -102,19 +96,8 @@ def as_likelihood_fit(
         chi2,
         dof,
         first.iterations + one.iterations,
-        bool(step @ (g - one.z) < settings.converged * len(one.white.e)),
-        first.history,
+        bool(step @ (g - one.z) < SETTINGS.converged * len(one.white.e)),
         residuals,
         first.starts,
-        _with_prior(one.priors, ~found.flat),
+        tuple(np.array(one.priors.names)[~found.flat].tolist()),
     )
-
-
-def _with_prior(priors: Priors, which: np.ndarray) -> dict[str, Prior]:
-    """(mean, standard deviation) by name, in the parameters' units."""
-    sigma = priors.sigma * np.where(priors.positive, priors.mean, 1.0)
-    return {
-        name: (float(mean), float(deviation))
-        for name, mean, deviation, own in zip(priors.names, priors.mean, sigma, which, strict=True)
-        if own
-    }

@@ -7,7 +7,6 @@ measured in all of them, or in none). The local polynomial model's covariance gi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,6 +37,7 @@ class ValidationSettings:
 
 
 SETTINGS = ValidationSettings()
+Measured = Campaign | FrequencyResponse
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +147,7 @@ def _without_figures(one: HeldOut) -> dict[str, Any]:
     return found if white is None else found | {"whiteness": {"white": white.white, "sentences": white.sentences}}
 
 
-def validate(
-    found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse
-) -> Validation:
+def validate(found: CampaignFit, fitted: Measured, held_out: Measured) -> Validation:
     """Prediction errors, their whiteness, responses and modes of the fitted model on data that no fit has used.
 
     Raises
@@ -169,15 +167,18 @@ def validate(
     modes, mode_note = _modes(found, [one[0] for one in blocks])
     drawn = _overlay(found, fitted, held_out, notes)
     verdict = verdict_of(figures)
-    said = (verdict, *_sentences(figures), *_mode_sentence(modes), mode_note, *_overlay_sentence(drawn))
+    said = [verdict, *_sentences(figures), *_mode_sentence(modes), mode_note]
+    if drawn:
+        said.append(
+            f"{100 * drawn.inside:.3g} % of the values of the measured frequency response lie within their 95 % "
+            f"confidence region about the model ({drawn.method})"
+        )
     return Validation(
-        found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict, said, tuple(notes)
+        found.fit.model.sensors.names, found.band_Hz, tuple(figures), drawn, modes, verdict, tuple(said), tuple(notes)
     )
 
 
-def _blocks(
-    found: CampaignFit, held_out: Campaign | FrequencyResponse
-) -> list[tuple[SpectralBlock, RecordSource | None]]:
+def _blocks(found: CampaignFit, held_out: Measured) -> list[tuple[SpectralBlock, RecordSource | None]]:
     """Spectra of the held-out data, in pieces if long; each with its record if it begins at the record's start."""
     model = found.fit.model
     if isinstance(held_out, FrequencyResponse):
@@ -197,9 +198,7 @@ def _blocks(
     return [(block, record) for block, (_, record) in zip(linear, blocks, strict=True)]
 
 
-def _with_noise(
-    found: CampaignFit, fitted: Campaign | FrequencyResponse, block: SpectralBlock
-) -> tuple[SpectralBlock, float, str]:
+def _with_noise(found: CampaignFit, fitted: Measured, block: SpectralBlock) -> tuple[SpectralBlock, float, str]:
     """The block with the noise of the fitted data, the real numbers used to estimate it, and a description."""
     if isinstance(fitted, FrequencyResponse):
         near = response_block(fitted.between(*found.band_Hz), found.fit.model)
@@ -242,7 +241,7 @@ def _inverse_dof(dof: float, n_y: int) -> float:
 
 def _figures(
     found: CampaignFit,
-    fitted: Campaign | FrequencyResponse,
+    fitted: Measured,
     block: SpectralBlock,
     noise_dof: float,
     words: str,
@@ -281,12 +280,8 @@ def _figures(
         floor_interval(error, float(floor.sum() / power.sum()), noise_dof / (2 * block.Y.size)),
         *_in_time(found, record),
         white,
-        _exact(found, block),
+        _root_all(prediction_error(found.first.model, block, derivative=False)) if found.tolerances else None,
     )
-
-
-def _exact(found: CampaignFit, block: SpectralBlock) -> float | None:
-    return _root_all(prediction_error(found.first.model, block, derivative=False)) if found.tolerances else None
 
 
 def floor_interval(error: PredictionError, floor: float, times: float) -> tuple[float, float]:
@@ -309,14 +304,13 @@ def _root_all(error: PredictionError) -> float:
     return float(np.linalg.norm(error.error) / np.linalg.norm(error.block.Y))
 
 
-def _local_chi2(
-    found: CampaignFit, fitted: Campaign | FrequencyResponse, raw: SpectralBlock, notes: list[str]
-) -> float:
+def _local_chi2(found: CampaignFit, fitted: Measured, raw: SpectralBlock, notes: list[str]) -> float:
     """chi-square per degree of freedom with the noise of the local polynomial model."""
     if isinstance(fitted, FrequencyResponse):
         return float("nan")
     try:
-        error = prediction_error(found.fit.model, measured_noise(fitted, raw, found.band_Hz), derivative=False)
+        (block,) = measured_noise([raw], fitted, found.band_Hz)
+        error = prediction_error(found.fit.model, block, derivative=False)
     except AvisError as failed:
         notes.append(f"record {raw.name}: no noise of a local polynomial model ({failed})")
         return float("nan")
@@ -374,12 +368,10 @@ def _modes(found: CampaignFit, blocks: list[SpectralBlock]) -> tuple[tuple[ModeR
         return (), f"no table of modes: {failed}"
 
 
-def _overlay(
-    found: CampaignFit, fitted: Campaign | FrequencyResponse, held_out: Campaign | FrequencyResponse, notes: list[str]
-) -> ResponseOverlay | None:
+def _overlay(found: CampaignFit, fitted: Measured, held_out: Measured, notes: list[str]) -> ResponseOverlay | None:
     """Responses from all measured data: a single record seldom separates all inputs."""
     if isinstance(fitted, Campaign) and isinstance(held_out, Campaign):
-        data: Campaign | FrequencyResponse = replace(fitted, records=(*fitted.records, *held_out.records))
+        data: Measured = replace(fitted, records=(*fitted.records, *held_out.records))
     else:
         data = held_out
     try:
@@ -449,27 +441,18 @@ def _sentences(figures: list[HeldOut]) -> list[str]:
 
 def _mode_sentence(modes: tuple[ModeRow, ...]) -> list[str]:
     """The largest difference between model and measured modes."""
-    known: list[Mapping[str, Any]] = [
-        {"what": what, "mode": row.frequency_Hz, "sigma": sigma}
+    known = [
+        (abs(sigma), what, row.frequency_Hz)
         for row in modes
         for what, sigma in (("frequency", row.frequency_sigma), ("damping", row.damping_sigma))
         if np.isfinite(sigma)
     ]
     if not known:
         return []
-    far = max(known, key=lambda one: abs(one["sigma"]))
+    sigma, what, mode = max(known)
     return [
-        f"model and measured modes differ by at most {abs(far['sigma']):.2g} standard deviations, in the "
-        f"{far['what']} of the mode at {far['mode']:.4g} Hz"
-    ]
-
-
-def _overlay_sentence(drawn: ResponseOverlay | None) -> list[str]:
-    if drawn is None:
-        return []
-    return [
-        f"{100 * drawn.inside:.3g} % of the values of the measured frequency response lie within their 95 % "
-        f"confidence region about the model ({drawn.method})"
+        f"model and measured modes differ by at most {sigma:.2g} standard deviations, in the {what} of the mode at "
+        f"{mode:.4g} Hz"
     ]
 
 

@@ -172,7 +172,7 @@ def identify(
             found.information, found.structure, floor, {name: sigma for name, (_, sigma) in options.priors.items()}
         )
         progress(f"the data determine {found.information.rank} of {len(model.names)} combinations of parameters")
-        advice = _advice(found, fitted, report, progress)
+        advice = _advice(found, fitted, progress)
         kalman, note = _kalman(split.fitted if split else measured, rig, model.names, options, progress)
         progress("validation on held-out data")
         validation = validate(found, fitted, held_out)
@@ -296,9 +296,7 @@ def _divided_lines(measured: FrequencyResponse) -> tuple[FrequencyResponse, Freq
     return measured.at(~near), measured.at(held)
 
 
-def _advice(
-    found: CampaignFit, fitted: Campaign | FrequencyResponse, report: IdentifiabilityReport, progress: Progress
-) -> tuple[str, ...]:
+def _advice(found: CampaignFit, fitted: Campaign | FrequencyResponse, progress: Progress) -> tuple[str, ...]:
     """Benefit of a further record like the fitted ones, or of another kind."""
     model = found.structure
     if found.information.rank == len(model.names) or not isinstance(fitted, Campaign):
@@ -310,9 +308,8 @@ def _advice(
     level = float(np.mean([h.level_V for h in driven]))
     try:
         drive = Drive(level, sum(h.duration_s for h in driven), found.band_Hz)
-        return needed_experiment(
-            found.information, model, drive, campaign_noise([one.block for one in found.fit.residuals]), report=report
-        )
+        noise = campaign_noise([one.block for one in found.fit.residuals])
+        return needed_experiment(found.information, model, drive, noise)
     except AvisError as error:
         return (f"No advice on further records: {error}",)
 

@@ -12,29 +12,23 @@ from avis_ctrl.identification.ekf_kernel import Plant, flow, propagate, update
 from avis_ctrl.identification.ekf_model import LinearModel, linear_model, source_parameters
 from avis_ctrl.identification.ekf_settings import HONEST_SETTINGS, SOURCE_SETTINGS, EkfSettings
 from avis_ctrl.identification.identifiability_text import main_members
-from avis_ctrl.rigs import load_rig
 from benchmarks.rademakers_records import source_campaign
 
 H1 = 1e-3
 
 
 @pytest.fixture(scope="module")
-def rig():
-    return load_rig("avis")
-
-
-@pytest.fixture(scope="module")
-def wrong(rig):
+def wrong(avis):
     """The rig with the source's parameters off by up to 25 %."""
     draw = np.random.default_rng(5)
-    return rig.with_parameters(
-        {name: rig.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25)) for name in source_parameters(rig)}
+    return avis.with_parameters(
+        {name: avis.parameters()[name].value * (1 + draw.uniform(-0.25, 0.25)) for name in source_parameters(avis)}
     )
 
 
 @pytest.fixture(scope="module")
-def campaign(rig):
-    return source_campaign(rig, sets=2, duration_s=10.0, seed=3)
+def campaign(avis):
+    return source_campaign(avis, sets=2, duration_s=10.0, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -97,8 +91,8 @@ def textbook(Phi, Gamma, Qd, H, R, x, P, u, y):
 # -- the linear limit ----------------------------------------------------------------------------------------------
 
 
-def linear_limit(rig, rng, samples=1500):
-    model = linear_model(rig, ())
+def linear_limit(avis, rng, samples=1500):
+    model = linear_model(avis, ())
     u, y = rng.normal(size=(samples, 8)), 1e-4 * rng.normal(size=(samples, 6))
     kalman = ParameterFilter(model, SOURCE_SETTINGS, np.full(6, 1e-10), H1)
     kalman.begin(np.zeros(6))
@@ -110,16 +104,16 @@ def linear_limit(rig, rng, samples=1500):
     return model, u, y, trace, (Phi, Gamma, Qd, P0)
 
 
-def test_without_parameters_it_is_the_textbook_kalman_filter(rig, rng):
-    model, u, y, trace, (Phi, Gamma, Qd, P0) = linear_limit(rig, rng)
+def test_without_parameters_it_is_the_textbook_kalman_filter(avis, rng):
+    model, u, y, trace, (Phi, Gamma, Qd, P0) = linear_limit(avis, rng)
     expected = textbook(Phi, Gamma, Qd, model.H, 1e-10 * np.eye(6), np.zeros(12), P0, u, y)
     size = np.max(np.abs(expected), axis=0)
     assert np.max(np.abs(trace.x - expected) / size) < 1e-8
 
 
-def test_without_parameters_it_is_filterpys_kalman_filter(rig, rng):
+def test_without_parameters_it_is_filterpys_kalman_filter(avis, rng):
     kalman = pytest.importorskip("filterpy.kalman", reason="filterpy belongs to the benchmarks extra")
-    model, u, y, trace, (Phi, Gamma, Qd, P0) = linear_limit(rig, rng, 300)
+    model, u, y, trace, (Phi, Gamma, Qd, P0) = linear_limit(avis, rng, 300)
     other = kalman.KalmanFilter(dim_x=12, dim_z=6, dim_u=8)
     other.x, other.P, other.F, other.B, other.Q = np.zeros(12), P0, Phi, Gamma, Qd
     other.H, other.R = model.H, 1e-10 * np.eye(6)
@@ -132,9 +126,9 @@ def test_without_parameters_it_is_filterpys_kalman_filter(rig, rng):
     assert np.max(np.abs(trace.x - seen) / size) < 1e-8
 
 
-def test_process_noise_of_a_sample(rig):
+def test_process_noise_of_a_sample(avis):
     """At 20 ms, where the damping and stiffness in it are far above round-off."""
-    A = linear_model(rig, ()).system(np.zeros(0))[0]
+    A = linear_model(avis, ()).system(np.zeros(0))[0]
     Q = np.diag([1e-8, 2e-8, 3e-8, 4e-8, 5e-8, 6e-8])
     for h in (1e-3, 2e-2):
         root = noise_root(A, la.block_diag(np.zeros((6, 6)), Q), h)
@@ -147,9 +141,9 @@ def test_process_noise_of_a_sample(rig):
 # -- Jacobians -----------------------------------------------------------------------------------------------------
 
 
-def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(rig, rng):
+def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(avis, rng):
     """Fourth order: a step lacks (omega h)^4 / 120 = 8e-9 of itself at 5 Hz, 2e-8 where s makes that 6 Hz."""
-    model = linear_model(rig, source_parameters(rig))
+    model = linear_model(avis, source_parameters(avis))
     s = 1 + rng.uniform(-0.2, 0.2, 26)
     x0, u = np.repeat([5e-6, 1e-4], 6) * rng.normal(size=12), rng.normal(size=8)
     x, Phi, Psi = flow(plant(model), s, x0, u, H1)
@@ -185,9 +179,9 @@ def test_the_sampled_jacobian_is_the_complex_step_of_the_matrix_exponential(rig,
                 assert np.max(error) < allowed * np.max(np.abs(column[half]))
 
 
-def test_a_disturbance_acts_as_a_held_acceleration(rig, rng):
+def test_a_disturbance_acts_as_a_held_acceleration(avis, rng):
     """Against the matrix exponential: f accelerates the table by G f during the sample, and decays at its end."""
-    model, G = linear_model(rig, ("mass",)), rng.normal(size=(6, 3))
+    model, G = linear_model(avis, ("mass",)), rng.normal(size=(6, 3))
     x0, u = np.concatenate([np.repeat([5e-6, 1e-4], 6), np.full(3, 1e-4)]) * rng.normal(size=15), rng.normal(size=8)
     x, Phi, _ = flow(plant(model, G, 0.9), np.ones(1), x0, u, H1)
     A, B = model.system(model.values)
@@ -230,13 +224,13 @@ def test_square_root_propagation_and_update_are_those_of_the_covariance(seed, n_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("R", [1e-8, 4e-16])
-def test_the_covariance_stays_definite_over_1e5_samples(rig, wrong, R):
+def test_the_covariance_stays_definite_over_1e5_samples(avis, wrong, R):
     """Smallest eigenvalue with every state at unit variance, at every 1e4th of 1e5 samples (seen: 3e-4)."""
     from avis_ctrl.identification.prefilter import prefilter, sensor_inverse
 
-    record = source_campaign(rig, sets=1, duration_s=100.0).records[0].load()
-    u, y = prefilter(record, sensor_inverse(rig, record.header.y_names, "V"), rig.loop_delay_s)
-    kalman = ParameterFilter(linear_model(wrong, source_parameters(rig)), SOURCE_SETTINGS, np.full(6, R), H1)
+    record = source_campaign(avis, sets=1, duration_s=100.0).records[0].load()
+    u, y = prefilter(record, sensor_inverse(avis, record.header.y_names, "V"), avis.loop_delay_s)
+    kalman = ParameterFilter(linear_model(wrong, source_parameters(avis)), SOURCE_SETTINGS, np.full(6, R), H1)
     kalman.begin(y[0])
     smallest = []
     for k in range(0, 100_000, 10_000):
@@ -283,7 +277,7 @@ def test_errors_are_as_large_as_the_filter_says():
     assert np.all(np.sqrt(np.diag(P)[:5]) < [0.3 * share, share, share, 0.3 * share, 0.3 * share])
 
 
-def test_a_filter_told_a_tenth_of_the_noise_is_seen_through(rig, wrong, campaign):
+def test_a_filter_told_a_tenth_of_the_noise_is_seen_through(avis, wrong, campaign):
     """R and Q far too small: the normalised innovation squared leaves its interval."""
     right = identify_ekf(wrong, campaign, EkfSettings(R=None, Q=1e-15, v_sigma=1e-4, reset=False))
     small = identify_ekf(wrong, campaign, EkfSettings(R=1.15e-14, Q=1e-15, v_sigma=1e-4, reset=False))
@@ -294,22 +288,22 @@ def test_a_filter_told_a_tenth_of_the_noise_is_seen_through(rig, wrong, campaign
 # -- the rig -------------------------------------------------------------------------------------------------------
 
 
-def determined(rig, names):
+def determined(avis, names):
     """How many combinations M, C and K depend on at all: the rank of the map from parameters to matrices."""
-    model = linear_model(rig, names)
+    model = linear_model(avis, names)
     columns = model.slopes.reshape(108, -1)
     return int(np.linalg.matrix_rank(columns / np.linalg.norm(columns, axis=0), tol=1e-9))
 
 
-def test_the_sources_26_parameters(rig):
-    names = source_parameters(rig)
+def test_the_sources_26_parameters(avis):
+    names = source_parameters(avis)
     assert len(names) == 26 and "isolator1.k_x" not in names and "isolator1.c_x" not in names
-    assert determined(rig, names) == 20
+    assert determined(avis, names) == 20
 
 
-def test_identification_from_25_percent_off(rig, wrong, honest):
-    names = source_parameters(rig)
-    true = np.array([rig.parameters()[name].value for name in names])
+def test_identification_from_25_percent_off(avis, wrong, honest):
+    names = source_parameters(avis)
+    true = np.array([avis.parameters()[name].value for name in names])
     result = honest
     z = (result.values - true) / result.sigma
     known = [names.index(name) for name in ("mass", "J1", "J2", "J3", "isolator3.k_z", "isolator4.c_z")]
@@ -351,11 +345,11 @@ def test_what_was_kept_from_record_to_record_tells_more_than_a_reset(wrong, camp
 
 
 @pytest.mark.slow
-def test_bands_hold_with_floor_motion_too(rig, wrong):
+def test_bands_hold_with_floor_motion_too(avis, wrong):
     """NEES of the 20 combinations that M, C and K depend on, over three campaigns with a moving floor."""
-    names = source_parameters(rig)
-    true = np.array([rig.parameters()[name].value for name in names])
-    model = linear_model(rig, names)
+    names = source_parameters(avis)
+    true = np.array([avis.parameters()[name].value for name in names])
+    model = linear_model(avis, names)
     columns = (
         np.concatenate(
             [
@@ -368,7 +362,7 @@ def test_bands_hold_with_floor_motion_too(rig, wrong):
     map_ = np.linalg.svd(columns)[2][:20]
     nees = []
     for seed in (11, 12, 13):
-        shaken = source_campaign(rig, sets=1, duration_s=30.0, seed=seed, floor_rms_m_per_s=2e-6)
+        shaken = source_campaign(avis, sets=1, duration_s=30.0, seed=seed, floor_rms_m_per_s=2e-6)
         result = identify_ekf(wrong, shaken, HONEST_SETTINGS)
         error, P = map_ @ (result.values / true - 1), map_ @ (result.covariance / np.outer(true, true)) @ map_.T
         nees.append(error @ np.linalg.solve(P, error))

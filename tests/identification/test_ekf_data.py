@@ -29,18 +29,13 @@ FEW = ("mass", "isolator3.k_z")
 
 
 @pytest.fixture(scope="module")
-def rig():
-    return load_rig("avis")
+def campaign(avis):
+    return source_campaign(avis, sets=2, duration_s=2.0, seed=4)
 
 
-@pytest.fixture(scope="module")
-def campaign(rig):
-    return source_campaign(rig, sets=2, duration_s=2.0, seed=4)
-
-
-def record_of(rig, u, y, unit="V", rate=1000.0):
+def record_of(avis, u, y, unit="V", rate=1000.0):
     header = RecordHeader(
-        "00", rate, len(u), rig.equations_of_motion().actuators, rig.geophones.names, "noise", y_unit=unit
+        "00", rate, len(u), avis.equations_of_motion().actuators, avis.geophones.names, "noise", y_unit=unit
     )
     return Record(header, u, y)
 
@@ -48,11 +43,11 @@ def record_of(rig, u, y, unit="V", rate=1000.0):
 # -- the simulated campaign ----------------------------------------------------------------------------------------
 
 
-def test_the_simulation_is_what_an_integrator_of_the_equations_finds(rig, rng):
+def test_the_simulation_is_what_an_integrator_of_the_equations_finds(avis, rng):
     """Held volts a sample late, floor velocity in ramps, geophone with its compensated corner in the time domain."""
     n, h = 40, 1e-3
     u, floor = rng.normal(size=(n, 8)), 1e-4 * rng.normal(size=(n + 1, 3))
-    eom, (_, rows), g = rig.equations_of_motion(), rig.sensor_rows(), rig.geophones
+    eom, (_, rows), g = avis.equations_of_motion(), avis.sensor_rows(), avis.geophones
     w = 2 * np.pi * g.compensated_Hz
 
     def slope(t, x, k):
@@ -69,13 +64,13 @@ def test_the_simulation_is_what_an_integrator_of_the_equations_finds(rig, rng):
         back = slope(k * h, x, k)[21:27]
         volts.append(back * np.array(g.sensitivity_Vs_per_m) * g.preamplifier_gain)
         x = solve_ivp(slope, (k * h, (k + 1) * h), x, args=(k,), rtol=1e-11, atol=1e-18).y[:, -1]
-    found = sensor_volts(rig, u, floor)
+    found = sensor_volts(avis, u, floor)
     assert np.max(np.abs(found - volts)) < 1e-8 * np.max(np.abs(volts))
 
 
-def test_drives_and_floor_have_the_variance_asked_for(rig, rng):
-    u = logical_drive(rig, 200_000, rng)
-    forces = u @ rig.equations_of_motion().T.T
+def test_drives_and_floor_have_the_variance_asked_for(avis, rng):
+    u = logical_drive(avis, 200_000, rng)
+    forces = u @ avis.equations_of_motion().T.T
     share = np.corrcoef(forces.T) - np.eye(6)
     assert np.max(np.abs(share)) < 0.02  # each axis by itself
     # x is driven by Ax2 and Ax4 with one volt each: 4 N/V at 0.25 V^2.
@@ -88,8 +83,8 @@ def test_drives_and_floor_have_the_variance_asked_for(rig, rng):
     assert np.allclose(np.std(floor, axis=0), 2e-6, rtol=0.05)
 
 
-def test_records_are_seeded_and_differ(rig, campaign):
-    again = source_campaign(rig, sets=1, duration_s=2.0, seed=4)
+def test_records_are_seeded_and_differ(avis, campaign):
+    again = source_campaign(avis, sets=1, duration_s=2.0, seed=4)
     assert np.array_equal(again.records[0].y, campaign.records[0].y)
     assert not np.allclose(campaign.records[0].u, campaign.records[1].u)
 
@@ -97,41 +92,41 @@ def test_records_are_seeded_and_differ(rig, campaign):
 # -- prefilter -----------------------------------------------------------------------------------------------------
 
 
-def velocities(rig, volts_per_motion, u):
+def velocities(avis, volts_per_motion, u):
     """Exact velocities along the sensors: a rig whose geophones have no corner to speak of."""
-    ideal = replace(rig, geophones=replace(rig.geophones, compensated_Hz=1e-9))
+    ideal = replace(avis, geophones=replace(avis.geophones, compensated_Hz=1e-9))
     return sensor_volts(ideal, u, np.zeros((len(u) + 1, 3))) / volts_per_motion
 
 
-def test_the_chain_is_undone_behind_the_high_pass(rig, rng):
+def test_the_chain_is_undone_behind_the_high_pass(avis, rng):
     """Against the exact velocity through the same high-pass; left in, the chain would err by a fifth."""
-    u = logical_drive(rig, 20_000, rng)
-    volts, gain = sensor_volts(rig, u, np.zeros((len(u) + 1, 3))), 3125.0
-    motion = velocities(rig, gain, u)
-    acting, found = prefilter(record_of(rig, u, volts), sensor_inverse(rig, rig.geophones.names, "V"), 1e-3)
-    plain = sensor_inverse(rig, rig.geophones.names, "m/s")
-    delayed_u, right = prefilter(record_of(rig, u, motion, "m/s"), plain, 1e-3)
+    u = logical_drive(avis, 20_000, rng)
+    volts, gain = sensor_volts(avis, u, np.zeros((len(u) + 1, 3))), 3125.0
+    motion = velocities(avis, gain, u)
+    acting, found = prefilter(record_of(avis, u, volts), sensor_inverse(avis, avis.geophones.names, "V"), 1e-3)
+    plain = sensor_inverse(avis, avis.geophones.names, "m/s")
+    delayed_u, right = prefilter(record_of(avis, u, motion, "m/s"), plain, 1e-3)
     assert np.std(found - right) < 5e-5 * np.std(right)
     assert np.array_equal(acting, delayed_u)
-    left_in = prefilter(record_of(rig, u, volts / gain, "m/s"), plain, 1e-3)[1]
+    left_in = prefilter(record_of(avis, u, volts / gain, "m/s"), plain, 1e-3)[1]
     assert 0.1 < np.std(left_in - right) / np.std(right) < 0.5
 
 
-def test_the_anti_alias_filter_acts_on_voltages_and_motion_alike(rig):
+def test_the_anti_alias_filter_acts_on_voltages_and_motion_alike(avis):
     """A sine of 20 Hz through force and chain: both come out turned by the filter, and by nothing else."""
     electronics = Electronics(anti_alias_corner_Hz=100.0, anti_alias_order=4)
-    filtered = replace(rig, electronics=electronics)
+    filtered = replace(avis, electronics=electronics)
     t, s = np.arange(20_000) / 1000, 2j * np.pi * 20.0
     chain = filtered.sensors()[0].chain().frequency_response(np.array([s.imag]))[0, 0, 0]
     turn = np.prod([pole / (pole - s) for pole in electronics.low_pass()])
     assert abs(turn - 1) > 0.4
-    motion, inverse = np.exp(s * t)[:, None], sensor_inverse(filtered, rig.geophones.names, "V")
+    motion, inverse = np.exp(s * t)[:, None], sensor_inverse(filtered, avis.geophones.names, "V")
     for part in (np.real, np.imag):
-        record = record_of(rig, part(motion) * np.ones(8), part(chain * motion) * np.ones(6))
+        record = record_of(avis, part(motion) * np.ones(8), part(chain * motion) * np.ones(6))
         seen_u, seen_y = prefilter(record, inverse, 0.0)
         plain = prefilter(
-            record_of(rig, part(turn * motion) * np.ones(8), part(turn * motion) * np.ones(6), "m/s"),
-            sensor_inverse(rig, rig.geophones.names, "m/s"),
+            record_of(avis, part(turn * motion) * np.ones(8), part(turn * motion) * np.ones(6), "m/s"),
+            sensor_inverse(avis, avis.geophones.names, "m/s"),
             0.0,
         )
         for found, right in zip((seen_u, seen_y), plain, strict=True):
@@ -139,14 +134,14 @@ def test_the_anti_alias_filter_acts_on_voltages_and_motion_alike(rig):
             assert np.max(np.abs(found - right)[15_000:]) < 3e-3
 
 
-def test_units_of_y(rig, rng):
+def test_units_of_y(avis, rng):
     """A sine of 5 Hz as acceleration becomes velocity; displacement stays what it is."""
     t, w = np.arange(20_000) / 1000, 2 * np.pi * 5
     u, late = np.zeros((len(t), 8)), slice(15_000, None)
     out = {}
     for unit, y in (("m/s", np.sin(w * t)), ("m/s^2", w * np.cos(w * t)), ("m", -np.cos(w * t) / w)):
-        inverse = sensor_inverse(rig, rig.geophones.names, unit)
-        out[unit] = prefilter(record_of(rig, u, y[:, None] * np.ones(6), unit), inverse, 0.0)[1][late, 0]
+        inverse = sensor_inverse(avis, avis.geophones.names, unit)
+        out[unit] = prefilter(record_of(avis, u, y[:, None] * np.ones(6), unit), inverse, 0.0)[1][late, 0]
         assert inverse.motion == ("displacement" if unit == "m" else "velocity")
     # Tustin's integrator lags sin by less than (w h)^2 / 12 = 8e-5 of it.
     assert np.max(np.abs(out["m/s^2"] - out["m/s"])) < 2e-4
@@ -170,13 +165,13 @@ def test_the_sources_settings():
     assert (s.highpass_Hz, s.highpass_order, s.reset) == (1.0, 6, True)
 
 
-def test_honest_noise_is_the_rigs(rig):
-    names = rig.geophones.names
+def test_honest_noise_is_the_rigs(avis):
+    names = avis.geophones.names
     lsb = 20 / 2**14
-    assert np.allclose(measurement_variance(HONEST_SETTINGS, rig, names, "V"), (1e-6 + lsb**2 / 12) / 3125**2)
-    floor = floor_noise(HONEST_SETTINGS, rig)
-    assert floor.density == pytest.approx(4e-12 / (2 * 59.5)) and floor_noise(SOURCE_SETTINGS, rig) is None
-    by_f, by_w = floor.acceleration(rig)
+    assert np.allclose(measurement_variance(HONEST_SETTINGS, avis, names, "V"), (1e-6 + lsb**2 / 12) / 3125**2)
+    floor = floor_noise(HONEST_SETTINGS, avis)
+    assert floor.density == pytest.approx(4e-12 / (2 * 59.5)) and floor_noise(SOURCE_SETTINGS, avis) is None
+    by_f, by_w = floor.acceleration(avis)
     # x by hand: four isolators of 84 kN/m and 375 N s/m in all on 500 kg.
     assert by_w[0, 0] == pytest.approx(375 / 500) and by_f[0, 0] == pytest.approx((84e3 - np.pi * 375) / 500)
 
@@ -191,9 +186,9 @@ def test_white_innovations_are_consistent_and_others_not(rng):
 
 
 @pytest.mark.slow
-def test_curves_of_the_sources_figures(rig, campaign):
-    names = source_parameters(rig)
-    result = identify_ekf(rig, campaign, names=names)
+def test_curves_of_the_sources_figures(avis, campaign):
+    names = source_parameters(avis)
+    result = identify_ekf(avis, campaign, names=names)
     assert {title: len(index) for title, index in kinds(result).items()} == {
         "Mass and inertia": 4,
         "Damping": 11,
@@ -221,15 +216,15 @@ def test_curves_of_the_sources_figures(rig, campaign):
         (("isolator1.p_z",), "positive starting value"),
     ],
 )
-def test_parameters_that_the_filter_cannot_take(rig, campaign, names, message):
+def test_parameters_that_the_filter_cannot_take(avis, campaign, names, message):
     with pytest.raises(InputError, match=message):
-        identify_ekf(rig, campaign, SOURCE_SETTINGS, names)
+        identify_ekf(avis, campaign, SOURCE_SETTINGS, names)
 
 
-def test_a_parameter_that_is_not_linear_is_refused(rig):
+def test_a_parameter_that_is_not_linear_is_refused(avis):
     """The centre of mass enters the inertia by its square."""
     with pytest.raises(InputError, match="must be linear"):
-        linear_model(rig.with_parameters({"com_x": 0.1}), ("com_x",))
+        linear_model(avis.with_parameters({"com_x": 0.1}), ("com_x",))
 
 
 def test_parameters_of_another_rig(campaign):
@@ -242,9 +237,9 @@ def test_parameters_of_another_rig(campaign):
 @pytest.mark.parametrize(
     "change, message", [({"highpass_Hz": 600.0}, "between 0 and 500"), ({"highpass_order": 2}, "whole number from 3")]
 )
-def test_settings_that_make_no_sense(rig, campaign, change, message):
+def test_settings_that_make_no_sense(avis, campaign, change, message):
     with pytest.raises(InputError, match=message):
-        identify_ekf(rig, campaign, EkfSettings(**change), FEW)
+        identify_ekf(avis, campaign, EkfSettings(**change), FEW)
 
 
 @pytest.mark.parametrize(
@@ -267,40 +262,40 @@ def test_settings_are_checked_by_name(change):
         EkfSettings(**change)
 
 
-def test_data_that_do_not_fit(rig, campaign):
+def test_data_that_do_not_fit(avis, campaign):
     record = campaign.records[0]
     with pytest.raises(InputError, match="expected V, m"):
-        identify_ekf(rig, [replace(record, header=replace(record.header, y_unit="mm"))], names=FEW)
+        identify_ekf(avis, [replace(record, header=replace(record.header, y_unit="mm"))], names=FEW)
     with pytest.raises(InputError, match="commanded voltages"):
-        identify_ekf(rig, [replace(record, header=replace(record.header, u_unit="N"))], names=FEW)
+        identify_ekf(avis, [replace(record, header=replace(record.header, u_unit="N"))], names=FEW)
     with pytest.raises(InputError, match="at least one record"):
-        identify_ekf(rig, [], names=FEW)
+        identify_ekf(avis, [], names=FEW)
     with pytest.raises(InputError, match="state R"):
-        identify_ekf(rig, [replace(record, header=replace(record.header, y_unit="m/s"))], HONEST_SETTINGS, FEW)
+        identify_ekf(avis, [replace(record, header=replace(record.header, y_unit="m/s"))], HONEST_SETTINGS, FEW)
     with pytest.raises(InputError, match="sensors of the rig"):
-        identify_ekf(rig, [replace(record, header=replace(record.header, y_names=tuple("abcdef")))], names=FEW)
+        identify_ekf(avis, [replace(record, header=replace(record.header, y_names=tuple("abcdef")))], names=FEW)
     with pytest.raises(InputError, match="u names"):
-        identify_ekf(rig, [replace(record, header=replace(record.header, u_names=tuple("abcdefgh")))], names=FEW)
+        identify_ekf(avis, [replace(record, header=replace(record.header, u_names=tuple("abcdefgh")))], names=FEW)
     other = replace(record, header=replace(record.header, name="01", sample_rate_Hz=500.0))
     with pytest.raises(InputError, match="sample_rate_Hz"):
-        identify_ekf(rig, Campaign("avis", (record, other)), names=FEW)
+        identify_ekf(avis, Campaign("avis", (record, other)), names=FEW)
     with pytest.raises(InputError, match="ambient"):
-        source_campaign(replace(rig, ambient=None))
+        source_campaign(replace(avis, ambient=None))
     with pytest.raises(InputError, match="ambient floor motion"):
-        floor_noise(HONEST_SETTINGS, replace(rig, ambient=None))
+        floor_noise(HONEST_SETTINGS, replace(avis, ambient=None))
     with pytest.raises(InputError, match="at least one set"):
-        source_campaign(rig, sets=0)
+        source_campaign(avis, sets=0)
 
 
-def test_a_filter_that_diverges_says_where(rig, campaign):
+def test_a_filter_that_diverges_says_where(avis, campaign):
     """Volts beyond all measure carry a mass below zero when nothing guards it."""
     record = campaign.records[0]
     loud = replace(record, y=record.y * 1e200)
     with pytest.raises(ComputationError, match=r"diverged in record 00; measured: after .* s of 2 s"):
-        identify_ekf(rig, [loud], SOURCE_SETTINGS, FEW)
+        identify_ekf(avis, [loud], SOURCE_SETTINGS, FEW)
 
 
-def test_some_channels_are_enough(rig, campaign):
+def test_some_channels_are_enough(avis, campaign):
     """Records of four geophones and the vertical motors."""
     record = campaign.records[0]
     header = replace(
@@ -309,7 +304,7 @@ def test_some_channels_are_enough(rig, campaign):
         y_names=tuple(record.header.y_names[k] for k in (1, 3, 5)),
     )
     picked = Record(header, record.u[:, [1, 3, 5, 7]], record.y[:, [1, 3, 5]])
-    result = identify_ekf(rig, [picked], SOURCE_SETTINGS, FEW)
+    result = identify_ekf(avis, [picked], SOURCE_SETTINGS, FEW)
     assert result.values.shape == (2,) and np.all(np.isfinite(result.sigma))
 
 

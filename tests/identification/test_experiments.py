@@ -16,7 +16,6 @@ from avis_ctrl.identification.experiment_plan import (
 )
 from avis_ctrl.identification.experiments import Added, Drive, Noise, changed, predicted_information
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.rigid_body import cross_matrix
 
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
@@ -24,11 +23,6 @@ BODY = ["mass", "J1", "J2", "J3"]
 CORNER = (0.4, 0.3, 0.1)
 NOISE = Noise(np.array([1.0]), 1e-6 * np.eye(6)[None])
 DRIVE = Drive(0.3, 60.0)
-
-
-@pytest.fixture(scope="module")
-def avis():
-    return load_rig("avis")
 
 
 def all_parameters(rig):

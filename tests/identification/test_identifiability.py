@@ -20,11 +20,6 @@ BODY = ["mass", "J1", "J2", "J3"]
 OMEGA = 2 * np.pi * np.geomspace(0.5, 60, 40)
 
 
-@pytest.fixture(scope="module")
-def avis():
-    return load_rig("avis")
-
-
 def sets(rig):
     channels = [f"actuator.{m.name}" for m in rig.motors] + [f"sensor.{name}" for name in rig.geophones.names]
     fixed = ("isolator1.k_x", "isolator1.c_x")

@@ -18,16 +18,10 @@ from avis_ctrl.identification.spectra import record_block, response_block, span
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.logical_axes import actuator_axes
 
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]
 BODY = ["mass", "J1", "J2", "J3"]
-
-
-@pytest.fixture(scope="module")
-def avis():
-    return load_rig("avis")
 
 
 def responses(model, noise=0.01, seed=0, lines=200):

@@ -26,18 +26,12 @@ from avis_ctrl.identification.validation import floor_interval, validate, verdic
 from avis_ctrl.identification.whiteness import whiteness
 from avis_ctrl.measurement.campaign import Campaign, Portion
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.study.files import as_json
 from avis_ctrl.study.plan_file import plan_from_table
 
 BAND = (0.5, 30.0)
-
-
-@pytest.fixture(scope="module")
-def avis():
-    return load_rig("avis")
 
 
 @pytest.fixture(scope="module")
@@ -245,15 +239,12 @@ def test_the_start_model_does_not_pass(found, records):
 
 def test_modes_and_their_spread_by_differences(true):
     """Against eigenvalues of numpy at displaced parameters, and the undamped frequencies of the rig."""
-    n_p = len(true.names)
-    found = model_modes(true, np.diag((1e-3 * true.values) ** 2))
-    rows = []
-    for j in range(n_p):
-        step = np.zeros(n_p)
-        step[j] = 1e-5 * true.values[j]
-        up, down = (model_modes(true.at(true.values + sign * step)) for sign in (1, -1))
-        rows.append(np.concatenate([up.frequency_Hz - down.frequency_Hz, up.damping - down.damping]) / 2e-5 * 1e-3)
-    assert np.allclose(found.covariance, np.transpose(rows) @ rows, rtol=1e-4, atol=1e-12)
+    for row in np.diag(true.values):
+        up, down = (model_modes(true.at(true.values + sign * 1e-5 * row)) for sign in (1, -1))
+        slope = np.concatenate([up.frequency_Hz - down.frequency_Hz, up.damping - down.damping]) / 2e-5
+        found = model_modes(true, np.outer(row, row))
+        size = np.abs(found.covariance).max()
+        assert np.allclose(found.covariance, np.outer(slope, slope), rtol=1e-3, atol=1e-6 * size)
     table = true.rig.equations_of_motion()
     assert np.allclose(found.frequency_Hz, table.natural_frequencies().frequencies_Hz, rtol=1e-3)
     assert [words.split()[0] for words in found.words[:4]] == ["y", "x", "z", "phi_z"]
@@ -296,26 +287,6 @@ def test_modes_that_cannot_be_measured_are_answered(true, records):
         model_modes(ResponseModel.of(free, ["mass"]))
 
 
-@pytest.mark.parametrize("name", ["mass", "isolator1.k_z", "isolator1.c_z"])
-def test_errors_of_the_modes_follow_from_each_parameter(true, name):
-    """Covariance of frequencies and damping ratios against central differences."""
-    j, step = true.names.index(name), 1e-5
-    sigma = 0.01 * true.values[j]
-    covariance = np.zeros((len(true.names),) * 2)
-    covariance[j, j] = sigma**2
-    moved = [
-        model_modes(true.at(true.values + sign * step * true.values[j] * np.eye(len(true.names))[j]), None)
-        for sign in (1, -1)
-    ]
-    slope = np.concatenate([moved[0].frequency_Hz - moved[1].frequency_Hz, moved[0].damping - moved[1].damping]) / (
-        2 * step * true.values[j]
-    )
-    found = model_modes(true, covariance).covariance
-    assert np.allclose(found, np.outer(slope, slope) * sigma**2, rtol=1e-3, atol=1e-6 * np.abs(found).max())
-    spread = np.sqrt(np.diag(found)[6:])
-    assert np.allclose(spread, np.abs(slope[6:]) * sigma, rtol=1e-3, atol=1e-6 * spread.max())
-
-
 def test_the_scatter_of_a_measured_response_is_that_of_its_noise(true):
     f = np.array([1.0, 2.5, 4.0, 20.0])
     exact, C = true.response(2 * np.pi * f)[:, :, :8], np.broadcast_to(1e-6 * np.eye(6), (4, 6, 6))
@@ -351,7 +322,7 @@ def test_noise_near_sharp_modes_is_measured(true):
     for k in range(4):
         e = factor @ (rng.normal(size=(len(w), 6, 1)) + 1j * rng.normal(size=(len(w), 6, 1))) / np.sqrt(2)
         block = SpectralBlock(f"{k}", w, np.zeros((len(w), 11, 1), complex), e, kind="k")
-        residuals.append(Residual(block, e, e, 0 * e))
+        residuals.append(Residual(block, e, e, e))
 
     def ratio(noise, dof):
         whole = np.trace(np.linalg.solve(noise, C), axis1=1, axis2=2).real / 6
@@ -373,7 +344,7 @@ def test_noise_where_few_lines_were_fitted_has_full_rank(true):
     e = rng.normal(size=(len(w), 6, 1)) + 1j * rng.normal(size=(len(w), 6, 1))
     block = SpectralBlock("0", w, np.zeros((len(w), 11, 1), complex), e, kind="k")
     sparse = block.lines(np.arange(2000, len(w)))
-    found = noise_from_residuals([Residual(block, e, e, 0 * e)], [sparse], true)[0]
+    found = noise_from_residuals([Residual(block, e, e, e)], [sparse], true)[0]
     assert found.dof >= 100
     assert np.linalg.eigvalsh(found.noise[:, 0]).min() > 0.5  # the variance of every output is 2
 

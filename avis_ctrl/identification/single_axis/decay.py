@@ -15,20 +15,35 @@ from avis_ctrl.identification.single_axis.fit import SingleAxisFit, concluded
 
 
 def fit_decay(
-    time: np.ndarray, channels: np.ndarray, corner_Hz: float, damping: float, drift: int = 1
+    time: np.ndarray,
+    channels: np.ndarray,
+    corner_Hz: float = 1.0,
+    damping: float = 0.1,
+    drift: int = 1,
+    start_s: float = 0.0,
+    end_s: float = np.inf,
 ) -> SingleAxisFit:
     """Corner frequency and damping ratio of a decay, common to all channels.
 
     Parameters
     ----------
-    time : (n,) s, starting after the release. channels : (n, c) or (n,), normalised here to unit standard deviation.
+    time : (n,) s. channels : (n, c) or (n,), normalised here to unit standard deviation.
     corner_Hz, damping : initial values. drift : degree of the polynomial of each channel's drifting zero.
+    start_s, end_s : of the decay, from after the release, on the scale of `time`.
 
     Raises
     ------
-    InputError : wrong initial values, a constant channel. ComputationError : no decaying oscillation fits.
+    InputError : fewer than 32 samples, wrong initial values, a constant channel.
+    ComputationError : no decaying oscillation fits.
     """
-    y = channels[:, None] if channels.ndim == 1 else channels
+    keep = (time >= start_s) & (time <= end_s)
+    if np.count_nonzero(keep) < 32:
+        raise InputError(
+            f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
+            field="start_s, end_s",
+            value=(start_s, end_s),
+        )
+    time, y = time[keep], (channels[:, None] if channels.ndim == 1 else channels)[keep]
     if not (corner_Hz > 0 and damping > 0) or not 0 <= drift <= 3:
         raise InputError(
             "expected a positive corner in Hz and damping to start from, and a drift of degree 0 to 3",

@@ -139,12 +139,6 @@ def long_run_covariance(scores: np.ndarray, lags: int) -> np.ndarray:
     return total
 
 
-def sandwich(bread: np.ndarray, scores: np.ndarray, lags: int, dof: float) -> np.ndarray:
-    """(p, p) covariance of an estimate: bread n S bread^T n/dof, dof = n minus the number of fitted parameters."""
-    n = len(scores)
-    return bread @ (n * long_run_covariance(scores, lags)) @ bread.T * n / dof
-
-
 def not_below(covariance: np.ndarray, bread: np.ndarray) -> np.ndarray:
     """The covariance with no variance below that of `bread`; correlations are kept.
 
@@ -205,7 +199,8 @@ def concluded(
     plain = bread @ np.einsum("nrp,nrq->pq", Z, Z) @ bread.T * level
     scores = np.einsum("nrp,nr->np", Z, e)
     used = andrews_lags(scores) if lags is None else min(lags, n // 4)
-    covariance = sandwich(bread, scores, used, n * (1 - spent / e.size))
+    # The factor allows for the degrees of freedom that the fit used.
+    covariance = bread @ (n * long_run_covariance(scores, used)) @ bread.T / (1 - spent / e.size)
     if lags is not None:
         covariance = not_below(covariance, plain)
     abscissa, measured, predicted = drawn

@@ -8,7 +8,7 @@ identify_single_axis("drive", file, {"force": "vir", "position": "qm", "referenc
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,14 +32,23 @@ ROLES: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "drive": ("force", ("position",), ("reference",)),
     "oscillator": ("u", ("y",), ()),
 }
-TRUTH, WORD, NUMBER, WHOLE, PAIR = (
-    "true or false",
-    "a word",
-    "a number",
-    "a whole number",
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and not np.isnan(value)
+
+
+# What is expected of an option, in words, and whether a value is that.
+Kind = tuple[str, Callable[[Any], bool]]
+TRUTH: Kind = ("true or false", lambda value: isinstance(value, bool))
+WORD: Kind = ("a word", lambda value: isinstance(value, str))
+NUMBER: Kind = ("a number", _number)
+WHOLE: Kind = ("a whole number", lambda value: isinstance(value, int) and _number(value))
+PAIR: Kind = (
     "two numbers, low and high",
+    lambda value: isinstance(value, (tuple, list)) and len(value) == 2 and all(map(_number, value)),
 )
-OPTIONS: dict[str, dict[str, str]] = {
+OPTIONS: dict[str, dict[str, Kind]] = {
     "seismometer": {"delay": TRUTH},
     "drive": {"cutoff_Hz": NUMBER, "coulomb": WORD, "offset": TRUTH},
     "oscillator": {"band_Hz": PAIR},
@@ -67,7 +76,7 @@ def identify_single_axis(
         "ground". decay: y. drive: force, position, and reference for instruments. oscillator: u, y.
     scale : role to the factor that converts the file's numbers to SI; 1 by default.
     sample_rate_Hz : for files without time.
-    options : of `fit_seismometer`, `fit_decay` (with start_s and end_s from the record's start), `fit_drive`,
+    options : of `fit_seismometer`, `fit_decay`, `fit_drive`,
         `fit_oscillator`.
 
     Raises
@@ -96,11 +105,13 @@ def identify_single_axis(
         responses, refused = stepped_sine(campaign, driven, measured, scale)
         fit = fit_seismometer(responses, **options)
         return replace(fit, notes=(*fit.notes, *(f"left out: {reason}" for reason in refused)))
-    time, channel = _channels(_single(campaign, path), driven, measured, scale)
+    if len(campaign.records) != 1:
+        raise InputError("expected one record", file=path, field="records", value=len(campaign.records))
+    time, channel = _channels(campaign.records[0], driven, measured, scale)
     if kind == "drive":
         return fit_drive(time, channel["position"], channel["force"], reference=channel.get("reference"), **options)
     if kind == "decay":
-        return _decay(time, channel["y"], **options)
+        return fit_decay(time, channel["y"], **options)
     rate = campaign.sample_rate_Hz
     return fit_oscillator(channel["u"], channel["y"], rate, **{"band_Hz": (0.005 * rate, 0.4 * rate)} | options)
 
@@ -170,18 +181,8 @@ def responses_of(records: Sequence[SineRecord], driven: str, measured: Sequence[
 def _check_option(kind: str, name: str, value: Any) -> None:
     if name not in OPTIONS[kind]:
         raise InputError(f"expected one of {', '.join(sorted(OPTIONS[kind]))}", field=f"option of {kind}", value=name)
-
-    def number(x: Any) -> bool:
-        return isinstance(x, (int, float)) and not isinstance(x, bool) and not np.isnan(x)
-
-    wanted, pair = OPTIONS[kind][name], isinstance(value, (tuple, list)) and len(value) == 2 and all(map(number, value))
-    if not {
-        TRUTH: isinstance(value, bool),
-        WORD: isinstance(value, str),
-        NUMBER: number(value),
-        WHOLE: isinstance(value, int) and number(value),
-        PAIR: pair,
-    }[wanted]:
+    wanted, fits = OPTIONS[kind][name]
+    if not fits(value):
         raise InputError(f"expected {wanted}", field=name, value=value)
 
 
@@ -233,12 +234,6 @@ def read_columns(
     return found
 
 
-def _single(campaign: Campaign, path: str | Path) -> RecordSource:
-    if len(campaign.records) != 1:
-        raise InputError("expected one record", file=path, field="records", value=len(campaign.records))
-    return campaign.records[0]
-
-
 def _channels(
     source: RecordSource, driven: str, measured: Sequence[str], scale: Mapping[str, float]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -252,22 +247,3 @@ def _channels(
             field = f"scale of {role}"
             raise InputError("expected a factor that keeps all samples finite", field=field, value=scale[role])
     return time, found
-
-
-def _decay(
-    time: np.ndarray,
-    y: np.ndarray,
-    corner_Hz: float = 1.0,
-    damping: float = 0.1,
-    start_s: float = 0.0,
-    end_s: float = np.inf,
-    drift: int = 1,
-) -> SingleAxisFit:
-    keep = (time >= start_s) & (time <= end_s)
-    if np.count_nonzero(keep) < 32:
-        raise InputError(
-            f"expected at least 32 samples between start_s and end_s; the record lasts {time[-1]:g} s",
-            field="start_s, end_s",
-            value=(start_s, end_s),
-        )
-    return fit_decay(time[keep], y[keep], corner_Hz, damping, drift)
