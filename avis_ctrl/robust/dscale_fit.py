@@ -50,13 +50,11 @@ class Fit(NamedTuple, Generic[Fitted]):
     error : max over the points of weight |log(|d| / target)|; for a matrix, of weight |log eig(X^-1 D^H D)| / 2.
     error_bound : no scaling of this order (for a matrix, over a scalar denominator) has a smaller error, because the
         bisection proved it infeasible.
-    solves : conic problems solved.
     """
 
     scaling: Fitted
     error: float
     error_bound: float
-    solves: int
 
 
 def fit_magnitude(
@@ -75,7 +73,7 @@ def fit_magnitude(
     weight = np.ones(omega.size) if weight is None else weight
     best, error = _constant_fit(target, weight)
     if order == 0 or error <= tolerance:
-        return Fit(best, error, error if order == 0 else 0.0, 0)
+        return Fit(best, error, error if order == 0 else 0.0)
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
 
@@ -99,10 +97,11 @@ def bisection(
 
     attempt : function of a level, a fit with its error, or None if the level is proved infeasible.
     """
-    lower, solves = 0.0, 0
-    while error - lower > tolerance and solves < 40:
+    lower = 0.0
+    for _ in range(40):
+        if error - lower <= tolerance:
+            break
         level = (lower + error) / 2
-        solves += 1
         try:
             found = attempt(level)
         except (ComputationError, InputError):
@@ -115,7 +114,7 @@ def bisection(
             # Feasible, but no better after factorisation: the limit of double precision.
             break
         best, error = found
-    return Fit(best, error, lower, solves)
+    return Fit(best, error, lower)
 
 
 def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling, float]:
