@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual, selected
 from avis_ctrl.robust.mu_power_kernel import FULL, search_complex
 from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -352,10 +352,10 @@ class _Search:
 
     def null_vectors(self, live: Array, count: int) -> Array:
         """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
-        part = LmiScalings(*(one[live] for one in self.scalings))
+        scalings = selected(self.scalings, live)
         everywhere = np.ones(self.structure.n_w, bool)
-        F = residual(self.M[live, None], part, np.ones(live.size), everywhere)[:, 0]
-        values, vectors = np.linalg.eigh(part.X_w)
+        F = residual(self.M[live, None], scalings, np.ones(live.size), everywhere)[:, 0]
+        values, vectors = np.linalg.eigh(scalings.X_w)
         root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
         _, null = np.linalg.eigh(dagger(root) @ F @ root)
         null = root @ null
