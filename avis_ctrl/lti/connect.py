@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti.interconnection import scaled_condition
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 
 
@@ -51,21 +52,9 @@ def connect(
     )
     read = [name for part in named.values() for name in part.inputs]
     made = [name for part in named.values() for name in part.outputs]
-    external = {name: k for k, name in enumerate(inputs)}
-    produced = {name: k for k, name in enumerate(made)}
     # u_parts = F y_parts + E u_external ;  y_out = G y_parts + H u_external
-    F, E = np.zeros((len(read), len(made))), np.zeros((len(read), len(inputs)))
-    for row, name in enumerate(read):
-        if name in external:
-            E[row, external[name]] = 1.0
-        else:
-            F[row, produced[name]] = 1.0
-    G, H = np.zeros((len(outputs), len(made))), np.zeros((len(outputs), len(inputs)))
-    for row, name in enumerate(outputs):
-        if name in produced:
-            G[row, produced[name]] = 1.0
-        else:
-            H[row, external[name]] = 1.0
+    F, E = _incidence(read, made), _incidence(read, inputs)
+    G, H = _incidence(outputs, made), _incidence(outputs, inputs)
     A, B, C, D = _close(total, F, E)
     return StateSpace(A, B, G @ C, G @ D + H, total.dt, tuple(inputs), tuple(outputs), total.states)
 
@@ -86,10 +75,15 @@ def signal_sources(parts: dict[str, StateSpace], inputs: Sequence[str]) -> dict[
     return source
 
 
+def _incidence(names: Sequence[str], sources: Sequence[str]) -> np.ndarray:
+    """(len(names), len(sources)): 1 where the names are equal, 0 elsewhere."""
+    return np.equal.outer(np.array(names, object), np.array(sources, object)).astype(float)
+
+
 def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray, ...]:
     """(A, B, C, D) from the external inputs e to all outputs y of the parts, with u = F y + E e."""
     loop = np.eye(total.noutputs) - total.D @ F
-    if total.noutputs and (condition := np.linalg.cond(_equilibrated(loop))) > 1e12:
+    if total.noutputs and (condition := scaled_condition(loop)) > 1e12:
         raise ComputationError(
             "the connection is not well posed",
             cause="an algebraic loop of unit gain",
@@ -99,15 +93,6 @@ def _close(total: StateSpace, F: np.ndarray, E: np.ndarray) -> tuple[np.ndarray,
     C = np.linalg.solve(loop, total.C)
     D = np.linalg.solve(loop, total.D @ E)
     return total.A + total.B @ F @ C, total.B @ (E + F @ D), C, D
-
-
-def _equilibrated(matrix: np.ndarray) -> np.ndarray:
-    """Scale the largest entry of each row and column to about one, so that signal units do not affect the condition."""
-    for _ in range(10):
-        for axis in (0, 1):
-            size = np.sqrt(np.max(np.abs(matrix), axis=axis, keepdims=True))
-            matrix = matrix / np.where(size > 0, size, 1.0)
-    return matrix
 
 
 def lft_lower(P: StateSpace, K: StateSpace) -> StateSpace:

@@ -58,14 +58,14 @@ def feedback(X: Quadruple, Y: Quadruple, sign: int) -> Quadruple:
     return out[:, :n], out[:, n:], y[:, :n], y[:, n:]
 
 
-def singular(D: np.ndarray, most: float) -> bool:
-    """Whether the condition number of a square matrix exceeds `most`, with rows and columns scaled to similar size, so
-    that their units do not matter."""
+def scaled_condition(D: np.ndarray) -> float:
+    """Condition number of a square matrix with rows and columns scaled to similar size, so that their units do not
+    matter."""
     for _ in range(SETTINGS.sweeps):
         for axis in (1, 0):
             size = np.linalg.norm(D, axis=axis, keepdims=True)
             D = D / np.where(size > 0, size, 1.0)
-    return bool(np.linalg.cond(D) > most)
+    return float(np.linalg.cond(D))
 
 
 def inverse(X: Quadruple) -> Quadruple:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti.rational import Rational
+from avis_ctrl.lti.rational import Rational, log_modulus
 
 DB = 20.0 / np.log(10.0)
 
@@ -70,20 +70,10 @@ class _Layout:
     def log_magnitude(self, x: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log|H| at omega and its Jacobian (n_omega, n_unknowns)."""
         zp, pp, rz, rp = self.split(x)
-        value, columns = np.full(omega.size, x[0]), [np.ones((omega.size, 1))]
-        for sign, pairs in ((1.0, zp), (-1.0, pp)):
-            for log_w, log_zeta in pairs:
-                w, zeta = np.exp(log_w), np.exp(log_zeta)
-                real, imag = w * w - omega**2, 2 * zeta * w * omega
-                square = real**2 + imag**2
-                value = value + sign * 0.5 * np.log(square)
-                columns.append(sign * np.stack([(2 * real * w * w + imag**2) / square, imag**2 / square], axis=1))
-        for sign, singles in ((1.0, rz), (-1.0, rp)):
-            for log_w in singles:
-                square = omega**2 + np.exp(2 * log_w)
-                value = value + sign * 0.5 * np.log(square)
-                columns.append(sign * (np.exp(2 * log_w) / square)[:, None])
-        return value, np.hstack(columns)
+        (zeros, by_zeros), (poles, by_poles) = log_modulus(zp, rz, omega), log_modulus(pp, rp, omega)
+        a, b = zp.size, pp.size
+        columns = (np.ones((omega.size, 1)), by_zeros[:, :a], -by_poles[:, :b], by_zeros[:, a:], -by_poles[:, b:])
+        return x[0] + zeros - poles, np.hstack(columns)
 
     def bounds(self, omega: np.ndarray, min_damping: float, reach: float) -> tuple[np.ndarray, np.ndarray]:
         low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)

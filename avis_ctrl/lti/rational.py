@@ -107,6 +107,21 @@ def _roots(pairs: Sequence[Section], real: Sequence[float]) -> np.ndarray:
     return np.concatenate([*found, -np.asarray(real, float)]).astype(complex)
 
 
+def log_modulus(pairs: np.ndarray, real: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """log |product of factors at j omega| (n_omega,), and its derivatives (n_omega, 2 n + m) by their logarithms.
+
+    pairs : (n, 2) logarithms of w [rad/s] and zeta of the factors s^2 + 2 zeta w s + w^2. real : (m,) logarithms of w
+    of the factors s + w. omega : (n_omega,) [rad/s].
+    """
+    square = np.asarray(omega, float)[:, None] ** 2
+    w2, w = np.exp(2 * pairs[:, 0]), np.exp(2 * real)
+    damping = 4 * np.exp(2 * pairs[:, 1]) * w2 * square
+    of_pair, of_real = (w2 - square) ** 2 + damping, square + w
+    slopes = np.stack([(2 * w2 * (w2 - square) + damping) / of_pair, damping / of_pair], axis=2)
+    value = 0.5 * (np.sum(np.log(of_pair), axis=1) + np.sum(np.log(of_real), axis=1))
+    return value, np.hstack([slopes.reshape(square.size, -1), w / of_real])
+
+
 def second_order_roots(corner_Hz: float, damping: float) -> np.ndarray:
     """Roots of s^2 + 2 zeta w s + w^2 [rad/s]."""
     return _roots([(2 * np.pi * corner_Hz, damping)], [])

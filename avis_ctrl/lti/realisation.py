@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -84,18 +86,8 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
     """Remove uncontrollable and unobservable states (staircase algorithm by SVD on the balanced system)."""
 
     def reachable(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-        size = np.linalg.norm(A, 2)
-        Q, s, _ = la.svd(B, full_matrices=False) if B.size else (np.zeros((A.shape[0], 0)), np.zeros(0), None)
-        basis = Q[:, s > tolerance * (s[0] if s.size else 1.0)]
-        new = basis
-        while new.shape[1] and basis.shape[1] < A.shape[0]:
-            step = A @ new
-            step = step - basis @ (basis.T @ step)
-            step = step - basis @ (basis.T @ step)
-            Q, s, _ = la.svd(step, full_matrices=False)
-            new = Q[:, s > tolerance * size]
-            basis = np.hstack([basis, new])
-        return basis
+        limits = tuple(tolerance * float(np.linalg.norm(one, 2)) if one.size else 0.0 for one in (B, A))
+        return reached(A, B, [A.shape[0]], limits)[0]
 
     if not system.nstates:
         return system
@@ -104,6 +96,37 @@ def minimal(system: StateSpace, tolerance: float = 1e-9) -> StateSpace:
     A, B, C = V.T @ base.A @ V, V.T @ base.B, base.C @ V
     W = reachable(A.T, C.T)
     return replace(system, A=W.T @ A @ W, B=W.T @ B, C=C @ W, states=())
+
+
+def reached(A: np.ndarray, B: np.ndarray, sizes: list[int], limits: Sequence[float]) -> tuple[np.ndarray, list[int]]:
+    """Smallest orthonormal block-diagonal V whose range contains B and A V, and its number of columns per block.
+
+    sizes : rows of the blocks; one block of all states gives the reachable subspace. limits : singular values of B, and
+    of what A adds, up to which they are round-off.
+    """
+    ends = [0, *np.cumsum(sizes)]
+    blocks = [slice(start, stop) for start, stop in pairwise(ends)]
+    bases = [np.zeros((size, 0)) for size in sizes]
+    step, limit = B, limits[0]
+    while True:
+        fresh = []
+        for k, block in enumerate(blocks):
+            new = step[block]
+            for _ in range(2):  # twice is enough for orthogonality to round-off
+                new = new - bases[k] @ (bases[k].T @ new)
+            Q, sigma, _ = np.linalg.svd(new, full_matrices=False)
+            Q = Q[:, sigma > limit]
+            bases[k] = np.hstack([bases[k], Q])
+            fresh.append(A[:, block] @ Q)
+        step = np.hstack([np.zeros((A.shape[0], 0)), *fresh])
+        limit = limits[1]
+        if not step.shape[1]:
+            break
+    V = np.zeros((A.shape[0], sum(basis.shape[1] for basis in bases)))
+    columns = [0, *np.cumsum([basis.shape[1] for basis in bases])]
+    for block, basis, (start, stop) in zip(blocks, bases, pairwise(columns), strict=True):
+        V[block, start:stop] = basis
+    return V, [basis.shape[1] for basis in bases]
 
 
 def with_rate_input(system: StateSpace, name: str, times: int) -> StateSpace:

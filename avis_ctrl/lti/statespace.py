@@ -19,7 +19,15 @@ import scipy.linalg as la
 from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series, singular
+from avis_ctrl.lti.interconnection import (
+    Quadruple,
+    feedback,
+    inverse,
+    parallel,
+    return_difference,
+    scaled_condition,
+    series,
+)
 from avis_ctrl.summary import count_of
 
 Names = tuple[str, ...]
@@ -195,7 +203,7 @@ class StateSpace:
             raise InputError(f"series connection of {other.noutputs} outputs into {self.ninputs} inputs")
         return StateSpace(
             *series(self.matrices, other.matrices),
-            _common_dt(self, other),
+            common_dt(self, other),
             other.inputs,
             self.outputs,
             self.states + other.states,
@@ -214,7 +222,7 @@ class StateSpace:
 
     def inverse(self) -> StateSpace:
         """The inverse, for S = (1 + L).inverse() or 1/(1 + L). InputError if D cannot be inverted."""
-        if self.ninputs != self.noutputs or singular(self.D, 1 / np.finfo(float).eps):
+        if self.ninputs != self.noutputs or scaled_condition(self.D) > 1 / np.finfo(float).eps:
             raise InputError(
                 "expected as many inputs as outputs, and a D that can be inverted: the inverse of a strictly proper "
                 "system is improper",
@@ -246,7 +254,7 @@ class StateSpace:
             raise InputError(f"parallel connection of shapes {self.D.shape} and {other.D.shape}")
         return StateSpace(
             *parallel(self.matrices, other.matrices),
-            _common_dt(self, other),
+            common_dt(self, other),
             self.inputs,
             self.outputs,
             self.states + other.states,
@@ -282,7 +290,7 @@ class StateSpace:
             raise InputError("the loop is not well posed: an algebraic loop without a solution", field="other")
         return StateSpace(
             *feedback(self.matrices, K.matrices, sign),
-            _common_dt(self, K),
+            common_dt(self, K),
             self.inputs,
             self.outputs,
             self.states + K.states,
@@ -504,7 +512,7 @@ def append(*systems: StateSpace) -> StateSpace:
         la.block_diag(*(s.B for s in systems)),
         la.block_diag(*(s.C for s in systems)),
         la.block_diag(*(s.D for s in systems)),
-        _common_dt(*systems),
+        common_dt(*systems),
         joined(s.inputs for s in systems),
         joined(s.outputs for s in systems),
         sum((s.states for s in systems), ()),
@@ -534,8 +542,8 @@ def _as_matrix(factor: np.ndarray | float, size: int) -> np.ndarray:
     return factor * np.eye(size) if factor.ndim == 0 else np.diag(factor) if factor.ndim == 1 else factor
 
 
-def _common_dt(*systems: StateSpace) -> float:
-    # A static gain is compatible with any sample time.
+def common_dt(*systems: Any) -> float:
+    """The sample time of systems to be connected; a static gain is compatible with any. InputError if they differ."""
     clocks = {s.dt for s in systems if s.nstates} or {s.dt for s in systems if s.dt} or {0.0}
     if len(clocks) > 1:
         raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")

@@ -121,7 +121,9 @@ def disk_margin(
         )
     place = np.concatenate([np.arange(w.start, w.stop) for block, w, _ in blocks.slices() if block.name in names])
     if place.size == blocks.n_w:
-        return _margin(mu_peak(N, blocks, slack=slack), skew)
+        peak = mu_peak(N, blocks, slack=slack)
+        lower, upper = (1 / bound if bound > 0 else np.inf for bound in (peak.upper, peak.lower))
+        return _margin(lower, upper, peak.omega, peak.delta, peak, skew)
     return _worst_case(N, blocks, place, skew, slack)
 
 
@@ -132,20 +134,12 @@ def _factors(name: str, n: int, skew: float) -> tuple[UncertainSystem, list[str]
     return UncertainSystem((1 + skew) / 2 * I, I, I, I, tuple(Dynamics(one) for one in names), (1,) * n), names
 
 
-def _margin(peak: MuPeak, skew: float) -> DiskMargin:
-    lower = 1 / peak.upper if peak.upper > 0 else np.inf
+def _margin(
+    lower: float, upper: float, omega: float, delta: np.ndarray | None, proof: MuPeak, skew: float
+) -> DiskMargin:
+    """The margins for bounds of alpha; proof : the bounds of mu that prove the lower one."""
     low, high = _gains(lower, skew)
-    return DiskMargin(
-        lower,
-        1 / peak.lower if peak.lower > 0 else np.inf,
-        peak.omega,
-        (low, high),
-        _phase(low, high),
-        peak.guaranteed,
-        skew,
-        peak.delta,
-        peak,
-    )
+    return DiskMargin(lower, upper, omega, (low, high), _phase(low, high), proof.guaranteed, skew, delta, proof)
 
 
 def _gains(alpha: float, skew: float) -> tuple[float, float]:
@@ -193,9 +187,8 @@ def _worst_case(N: Any, blocks: BlockStructure, place: np.ndarray, skew: float, 
             if found.lower >= 1:
                 counter = alpha, found
         alpha = (proved + unproved) / 2 if np.isfinite(unproved) else 2 * alpha
-    low, high = _gains(proved, skew)
     if counter is None:
-        return DiskMargin(proved, np.inf, peak.omega, (low, high), _phase(low, high), peak.guaranteed, skew, None, peak)
+        return _margin(proved, np.inf, peak.omega, None, peak, skew)
     broken, found = counter
     delta = None if found.delta is None else broken * np.diag(found.delta[place, rows])
-    return DiskMargin(proved, broken, found.omega, (low, high), _phase(low, high), peak.guaranteed, skew, delta, peak)
+    return _margin(proved, broken, found.omega, delta, peak, skew)

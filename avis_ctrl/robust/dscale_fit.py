@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import clarabel
 import numpy as np
@@ -44,24 +44,22 @@ class MagnitudeFitSettings:
 SETTINGS = MagnitudeFitSettings()
 
 
-@dataclass(frozen=True)
-class ScalarFit:
-    """A fitted d(s) with its error recomputed from the realised roots.
+class Fit(NamedTuple, Generic[Fitted]):
+    """A fitted scaling, with its error recomputed from the realised scaling.
 
-    error : max over the points of weight |log(|d| / target)|.
-    error_bound : no d(s) of this order has a smaller error (the bisection proved it infeasible).
-    solves : conic problems solved.
+    error : max over the points of weight |log(|d| / target)|; for a matrix, of weight |log eig(X^-1 D^H D)| / 2.
+    error_bound : no scaling of this order (for a matrix, over a scalar denominator) has a smaller error, because the
+        bisection proved it infeasible.
     """
 
-    scaling: ScalarScaling
+    scaling: Fitted
     error: float
     error_bound: float
-    solves: int
 
 
 def fit_magnitude(
     omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None = None, tolerance: float = 1e-3
-) -> ScalarFit:
+) -> Fit[ScalarScaling]:
     """Best log-Chebyshev fit of |d| at the frequencies by a d(s) of the given order.
 
     Parameters
@@ -70,15 +68,12 @@ def fit_magnitude(
     order : number of poles, and of zeros.
     weight : (n_omega,) in 0..1, weight of the logarithmic misfit at each point; default one.
     tolerance : gap between the error and its proved bound at which the bisection ends.
-
-    Raises
-    ------
-    InputError : different shapes, magnitudes or frequencies that are not positive and finite, a negative order.
     """
-    omega, target, weight = _checked(omega, magnitude, order, weight)
+    target = np.log(magnitude)
+    weight = np.ones(omega.size) if weight is None else weight
     best, error = _constant_fit(target, weight)
     if order == 0 or error <= tolerance:
-        return ScalarFit(best, error, error if order == 0 else 0.0, 0)
+        return Fit(best, error, error if order == 0 else 0.0)
     unit = float(np.exp(np.mean(np.log(omega))))
     problem = _Feasibility((omega / unit) ** 2, 2 * target, weight, order, initial_roots(omega / unit, target, order))
 
@@ -92,20 +87,21 @@ def fit_magnitude(
         problem = problem.recentred(np.roots(p[::-1]), np.roots(q[::-1]))
         return fitted, float(np.max(weight * np.abs(fitted.log_magnitude(omega) - target)))
 
-    return ScalarFit(*bisection(best, error, attempt, tolerance))
+    return bisection(best, error, attempt, tolerance)
 
 
 def bisection(
     best: Fitted, error: float, attempt: Callable[[float], tuple[Fitted, float] | None], tolerance: float
-) -> tuple[Fitted, float, float, int]:
-    """Bisection on the error of a fit, from the fit `best`: the last fit, its error, the proved bound, and the solves.
+) -> Fit[Fitted]:
+    """Bisection on the error of a fit, from the fit `best`.
 
     attempt : function of a level, a fit with its error, or None if the level is proved infeasible.
     """
-    lower, solves = 0.0, 0
-    while error - lower > tolerance and solves < 40:
+    lower = 0.0
+    for _ in range(40):
+        if error - lower <= tolerance:
+            break
         level = (lower + error) / 2
-        solves += 1
         try:
             found = attempt(level)
         except (ComputationError, InputError):
@@ -118,29 +114,7 @@ def bisection(
             # Feasible, but no better after factorisation: the limit of double precision.
             break
         best, error = found
-    return best, error, lower, solves
-
-
-def _checked(
-    omega: np.ndarray, magnitude: np.ndarray, order: int, weight: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Frequencies, log magnitudes and weights as float arrays."""
-    omega, magnitude = np.atleast_1d(np.asarray(omega, float)), np.atleast_1d(np.asarray(magnitude, float))
-    weight = np.ones(omega.size) if weight is None else np.atleast_1d(np.asarray(weight, float))
-    if omega.ndim != 1 or omega.shape != magnitude.shape or omega.shape != weight.shape or not omega.size:
-        raise InputError(f"omega {omega.shape}, magnitude {magnitude.shape} and weight {weight.shape} must be equal")
-    for field, array in (("omega", omega), ("magnitude", magnitude)):
-        if not np.all(np.isfinite(array) & (array > 0)):
-            raise InputError(
-                "expected positive finite numbers",
-                field=field,
-                value=float(array[~(np.isfinite(array) & (array > 0))][0]),
-            )
-    if not np.all((weight >= 0) & (weight <= 1)) or not np.any(weight > 0):
-        raise InputError("expected weights in 0..1, not all zero", field="weight")
-    if int(order) != order or order < 0:
-        raise InputError("expected a whole number of at least 0", field="order", value=order)
-    return omega, np.log(magnitude), weight
+    return Fit(best, error, lower)
 
 
 def _constant_fit(target: np.ndarray, weight: np.ndarray) -> tuple[ScalarScaling, float]:

@@ -19,10 +19,11 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, gain
 from avis_ctrl.robust.dscale_fit import (
     SETTINGS,
+    Fit,
     basis_scale,
     bisection,
     gram_cone,
@@ -36,29 +37,15 @@ from avis_ctrl.robust.dscale_fit import (
 from avis_ctrl.robust.scalings import MatrixScaling
 
 
-@dataclass(frozen=True)
-class HermitianFit:
-    """A fitted D(s), with its error recomputed from the state space.
-
-    error : max over the points of weight |log eig(X^-1 D^H D)| / 2; for n = 1 the misfit of log |d|.
-    error_bound : no D(s) of this degree over a scalar denominator has a smaller error.
-    """
-
-    scaling: MatrixScaling
-    error: float
-    error_bound: float
-    solves: int
-
-
 def fit_hermitian(
     omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None = None, tolerance: float = 1e-2
-) -> HermitianFit:
+) -> Fit[MatrixScaling]:
     """Log-Chebyshev fit of X (n_omega, n, n) at omega [rad/s] by D^H D, where D has n * degree states.
 
-    weight (n_omega,) in 0..1; the bisection ends when error and bound differ by at most the tolerance.
-    Raises InputError for inconsistent shapes or an X that is not Hermitian positive definite.
+    weight (n_omega,) in 0..1; the bisection ends when error and bound differ by at most the tolerance. Raises
+    LinAlgError if an X is not positive definite.
     """
-    omega, X, weight = _checked(omega, X, degree, weight)
+    X, weight = (X + np.conj(np.swapaxes(X, 1, 2))) / 2, np.ones(omega.size) if weight is None else weight
     C = la.cholesky(np.mean(X.real, axis=0))
     whitened = _congruence(X, np.linalg.inv(C))
     unit = float(np.exp(np.mean(np.log(omega))))
@@ -72,26 +59,7 @@ def fit_hermitian(
         candidate = _with_right_factor(_spectral_factor(*found, problem.e, unit), C)
         return candidate, _error(candidate, omega, X, weight)
 
-    return HermitianFit(*bisection(best, _error(best, omega, X, weight), attempt, tolerance))
-
-
-def _checked(
-    omega: np.ndarray, X: np.ndarray, degree: int, weight: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    omega, X = np.atleast_1d(np.asarray(omega, float)), np.asarray(X, complex)
-    weight = np.ones(omega.size) if weight is None else np.asarray(weight, float)
-    if X.ndim != 3 or X.shape[1] != X.shape[2] or omega.shape != (X.shape[0],) or weight.shape != omega.shape:
-        raise InputError(f"omega {omega.shape}, weight {weight.shape} and X {X.shape} do not fit (n_omega, n, n)")
-    if not (np.all(np.isfinite(omega)) and np.all(omega > 0)):
-        raise InputError("expected positive finite numbers", field="omega")
-    if not np.all(np.isfinite(X)) or np.max(np.abs(X - np.conj(np.swapaxes(X, 1, 2)))) > 1e-6 * np.max(np.abs(X)):
-        raise InputError("expected finite Hermitian matrices", field="X")
-    X = (X + np.conj(np.swapaxes(X, 1, 2))) / 2
-    if np.min(np.linalg.eigvalsh(X)) <= 0:
-        raise InputError("expected positive definite matrices", field="X")
-    if int(degree) != degree or degree < 0:
-        raise InputError("expected a whole number of at least 0", field="degree", value=degree)
-    return omega, X, weight
+    return bisection(best, _error(best, omega, X, weight), attempt, tolerance)
 
 
 def _congruence(X: np.ndarray, T: np.ndarray) -> np.ndarray:

@@ -67,21 +67,7 @@ class ScaledProblem:
 
     def normal(self, scalings: Scalings) -> NormalForm:
         """Normal form of the scaled plant, with extra channels if D12 or D21 is rank deficient."""
-        S = scalings.scale(self.P)
-        w, z = S.ninputs - self.ncon, S.noutputs - self.nmeas
-        plant = Plant(
-            S.A,
-            S.B[:, :w],
-            S.B[:, w:],
-            S.C[:z],
-            S.C[z:],
-            S.D[:z, :w],
-            S.D[:z, w:],
-            S.D[z:, :w],
-            S.D[z:, w:],
-            S.inputs[w:],
-            S.outputs[z:],
-        )
+        plant = Plant.split(scalings.scale(self.P), self.nmeas, self.ncon)
         return normal_form(
             regularised(plant, SETTINGS.regularisation, *self.singular, False) if any(self.singular) else plant
         )

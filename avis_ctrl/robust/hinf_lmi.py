@@ -107,18 +107,16 @@ def _scaled(plant: Plant, size: float) -> Plant:
     poles = np.abs(la.eigvals(plant.A)) if plant.n else np.ones(1)
     rate = float(np.exp(np.mean(np.log(np.maximum(poles, 1e-3 * max(np.max(poles), 1e-12))))))
     root, half = np.sqrt(rate), np.sqrt(size)
-    return Plant(
-        plant.A / rate,
-        plant.B1 / root / half,
-        plant.B2 / root,
-        plant.C1 / root / half,
-        plant.C2 / root,
-        plant.D11 / size,
-        plant.D12 / half,
-        plant.D21 / half,
-        plant.D22,
-        plant.u,
-        plant.y,
+    return replace(
+        plant,
+        A=plant.A / rate,
+        B1=plant.B1 / root / half,
+        B2=plant.B2 / root,
+        C1=plant.C1 / root / half,
+        C2=plant.C2 / root,
+        D11=plant.D11 / size,
+        D12=plant.D12 / half,
+        D21=plant.D21 / half,
     )
 
 

@@ -32,7 +32,7 @@ Signals = int | str | Sequence[str]
 
 @dataclass(frozen=True)
 class Plant:
-    """Partitioned continuous-time plant with balanced states; names of u and y for messages."""
+    """Partitioned continuous-time plant; names of u and y for messages."""
 
     A: np.ndarray
     B1: np.ndarray
@@ -49,7 +49,11 @@ class Plant:
     @staticmethod
     def of(P: StateSpace, nmeas: int, ncon: int) -> Plant:
         """Balance P (w, u -> z, y) and split it by its last nmeas outputs and last ncon inputs."""
-        P = balance(P)
+        return Plant.split(balance(P), nmeas, ncon)
+
+    @staticmethod
+    def split(P: StateSpace, nmeas: int, ncon: int) -> Plant:
+        """Like `of`, with the states as they are."""
         w, z = P.ninputs - ncon, P.noutputs - nmeas
         return Plant(
             P.A,

@@ -24,7 +24,7 @@ import numpy as np
 import scipy.linalg as la
 
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual, selected
 from avis_ctrl.robust.mu_upper import bound_for_goal
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -119,118 +119,89 @@ def proved_intervals(N: StateSpace, scalings: LmiScalings, inside: Interval) -> 
 
 @dataclass
 class Cover:
-    """Result: the level reached, the remaining gaps, and the frequencies where the level was raised.
+    """Proof of a level on a band: the level reached, the remaining gaps, and the frequencies where it was raised.
 
-    looked : gaps processed since the level was last raised because of their number; widened : how often it was raised.
+    scaled : function of a level, the system whose mu must be at most 1 for the level to be valid, with the blocks of
+        `structure`.
+    bound : function of responses of N, the level that scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove.
+    intervals : number of intervals proved. looked : gaps processed since the level was last raised because of their
+        number; widened : how often it was raised.
     """
 
+    N: StateSpace
+    structure: BlockStructure
+    scaled: Callable[[float], StateSpace]
+    bound: Callable[[Array], Array]
     level: float
+    slack: float
     gaps: list[Interval] = field(default_factory=list)
     raised_at: list[float] = field(default_factory=list)
     intervals: int = 0
     looked: int = 0
     widened: int = 0
 
+    def run(self, band: Interval, samples: Array, rounds: int = 60, most: int = 1500) -> Cover:
+        """Prove the level on a band, which is first split at `samples`, and raise it if the bound of a gap requires it.
 
-def cover(
-    N: StateSpace,
-    structure: BlockStructure,
-    scaled: Callable[[StateSpace, float], StateSpace],
-    bound: Callable[[Array], Array],
-    level: float,
-    band: Interval,
-    samples: Array,
-    *,
-    slack: float,
-    rounds: int = 60,
-    most: int = 1500,
-) -> Cover:
-    """Prove a level on a whole band, and raise it if the bound of a gap requires a higher level.
+        The level is raised to the required level plus the fraction `slack`; if it needs too many intervals, it is
+        raised by `slack`, then by twice, four times .. `slack`. Gaps that are not proved within `rounds` rounds or
+        `most` gaps stay in `gaps`.
+        """
+        samples = samples[(samples >= band[0]) & (samples <= band[1])]
+        edges = np.unique(np.concatenate([[band[0]], samples, [band[1]]]))
+        self.gaps = list(pairwise(edges.tolist()))
+        total = 0
+        for _ in range(rounds):
+            total += len(self.gaps)
+            self.looked += len(self.gaps)
+            if not self.gaps or total > most or not np.isfinite(self.level):
+                break
+            if self.looked > SETTINGS.patience and self.widened < SETTINGS.widenings:
+                self.level *= 1 + self.slack * 2.0**self.widened
+                self.looked, self.widened = 0, self.widened + 1
+            self._one_round()
+        return self
 
-    scaled(N, level) is the system whose mu must be at most 1 for the level to be valid; bound(M) gives the level that
-    scalings shared along axis 1 of M (B, n_shared, n_z, n_w) prove. The band is first split at `samples`. The level is
-    raised to the required level plus the fraction `slack`; if it needs too many intervals, it is raised by `slack`,
-    then by twice, four times .. `slack`. Gaps that are not proved within `rounds` rounds or `most` gaps stay in `gaps`.
-    """
-    state = Cover(level)
-    samples = np.unique(samples[(samples >= band[0]) & (samples <= band[1])])
-    edges = np.unique(np.concatenate([[band[0]], samples, [band[1]]]))
-    state.gaps = list(pairwise(edges.tolist()))
-    total = 0
-    for _ in range(rounds):
-        total += len(state.gaps)
-        state.looked += len(state.gaps)
-        if not state.gaps or total > most or not np.isfinite(state.level):
-            break
-        if state.looked > SETTINGS.patience and state.widened < SETTINGS.widenings:
-            state.level *= 1 + slack * 2.0**state.widened
-            state.looked, state.widened = 0, state.widened + 1
-        _one_round(N, structure, scaled, bound, state, slack)
-    return state
+    def _one_round(self) -> None:
+        unit = self.scaled(self.level)
+        gaps, self.gaps = self.gaps, []
+        shared = bound_for_goal(_in_gaps(unit, gaps), self.structure, accuracy_of(self.slack), 1.0)
+        open_gaps = []
+        for k, gap in enumerate(gaps):
+            if shared.beta[k] >= 1.0:
+                open_gaps.append(gap)
+                continue
+            self.intervals += 1
+            self.gaps += _without(gap, proved_intervals(unit, selected(shared.scalings, k), gap))
+        if open_gaps:
+            self._split_or_raise(unit, open_gaps)
 
+    def _split_or_raise(self, unit: StateSpace, open_gaps: list[Interval]) -> None:
+        """Halve the gaps; raise the level if a single frequency in a gap (or a gap too narrow to halve) requires it.
 
-def _points(low: float, high: float) -> list[float]:
-    middle = midpoint(low, high)
-    return [low, middle, midpoint(low, middle), high]
-
-
-def _one_round(
-    N: StateSpace,
-    structure: BlockStructure,
-    scaled: Callable[[StateSpace, float], StateSpace],
-    bound: Callable[[Array], Array],
-    state: Cover,
-    slack: float,
-) -> None:
-    unit = scaled(N, state.level)
-    gaps, state.gaps = state.gaps, []
-    omega = np.array([_points(*gap) for gap in gaps])
-    M = unit.frequency_response(omega.ravel()).reshape(*omega.shape, unit.noutputs, unit.ninputs)
-    shared = bound_for_goal(M, structure, accuracy_of(slack), 1.0)
-    open_gaps = []
-    for k, gap in enumerate(gaps):
-        if shared.beta[k] >= 1.0:
-            open_gaps.append(gap)
-            continue
-        state.intervals += 1
-        proved = proved_intervals(unit, LmiScalings(*(s[k] for s in shared.scalings)), gap)
-        state.gaps += _without(gap, proved)
-    if open_gaps:
-        _split_or_raise(N, unit, structure, bound, state, open_gaps, slack)
+        unit : N scaled so that the level is one.
+        """
+        middles = np.array([midpoint(*gap) for gap in open_gaps])
+        M = unit.frequency_response(middles)[:, None]
+        above = middles[bound_for_goal(M, self.structure, accuracy_of(self.slack), 1.0).beta >= 1.0]
+        needed = self.bound(self.N.frequency_response(above)[:, None]) if above.size else above
+        narrow = [gap for gap in open_gaps if _is_narrow(gap)]
+        for (low, high), middle in zip(open_gaps, middles.tolist(), strict=True):
+            self.gaps += [(low, high)] if _is_narrow((low, high)) else [(low, middle), (middle, high)]
+        if narrow:
+            needed = np.concatenate([needed, self.bound(_in_gaps(self.N, narrow))])
+            above = np.concatenate([above, [midpoint(*gap) for gap in narrow]])
+        if needed.size and needed[worst := int(np.argmax(needed))] > self.level:
+            self.level = float(needed[worst]) * (1 + self.slack)
+            self.raised_at.append(float(above[worst]))
 
 
-def _split_or_raise(
-    N: StateSpace,
-    unit: StateSpace,
-    structure: BlockStructure,
-    bound: Callable[[Array], Array],
-    state: Cover,
-    open_gaps: list[Interval],
-    slack: float,
-) -> None:
-    """Halve the gaps; raise the level if a single frequency in a gap (or a gap too narrow to halve) requires it.
-
-    unit : N scaled so that the level is one.
-    """
-    middles = np.array([midpoint(*gap) for gap in open_gaps])
-    at_one = bound_for_goal(unit.frequency_response(middles)[:, None], structure, accuracy_of(slack), 1.0).beta
-    above = middles[at_one >= 1.0]
-    needed = bound(N.frequency_response(above)[:, None]) if above.size else above
-    narrow = [gap for gap in open_gaps if _is_narrow(gap)]
-    for (low, high), middle in zip(open_gaps, middles.tolist(), strict=True):
-        state.gaps += [(low, high)] if _is_narrow((low, high)) else [(low, middle), (middle, high)]
-    middles = above
-    if narrow:
-        points = np.array([_points(*gap) for gap in narrow])
-        raw = N.frequency_response(points.ravel()).reshape(*points.shape, N.noutputs, N.ninputs)
-        shared = bound(raw)
-        needed, middles = np.concatenate([needed, shared]), np.concatenate([middles, points[:, 1]])
-    if not needed.size:
-        return
-    worst = int(np.argmax(needed))
-    if needed[worst] > state.level:
-        state.level = float(needed[worst]) * (1 + slack)
-        state.raised_at.append(float(middles[worst]))
+def _in_gaps(N: StateSpace, gaps: list[Interval]) -> Array:
+    """Responses (n, 4, n_z, n_w) at both ends of each gap, in its middle, and in between."""
+    omega = np.array(
+        [(low, middle, midpoint(low, middle), high) for low, high in gaps for middle in [midpoint(low, high)]]
+    )
+    return N.frequency_response(omega.ravel()).reshape(*omega.shape, N.noutputs, N.ninputs)
 
 
 def accuracy_of(slack: float) -> float:

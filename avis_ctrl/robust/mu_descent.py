@@ -26,7 +26,7 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import StateSpace, lft_lower
 from avis_ctrl.robust.controller_entries import ControllerEntries
 from avis_ctrl.robust.frequency_grid import frequency_grid, merged, resonances
-from avis_ctrl.robust.mu_lmi import Array, dagger, residual
+from avis_ctrl.robust.mu_lmi import Array, dagger, joined, residual
 from avis_ctrl.robust.mu_scan import refine_maxima
 from avis_ctrl.robust.mu_upper import UpperBound, block_balance, expand, upper_bound
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -243,7 +243,7 @@ def _highest(task: Task, M: Array, sharpness: float) -> tuple[Array, UpperBound]
     if not further.size:
         return falling[: settings.first], first
     rest = upper_bound(M[further][:, None], structure, settings.accuracy)
-    return np.concatenate([falling[: settings.first], further]), UpperBound.joined([first, rest])
+    return np.concatenate([falling[: settings.first], further]), joined([first, rest])
 
 
 def _resolvent(K: StateSpace, omega: Array) -> Array:

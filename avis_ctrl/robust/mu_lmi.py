@@ -14,8 +14,9 @@ Several matrices may share one set of scalings (axis 1 of M); the bound is then 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from avis_ctrl.robust.mu_kernel import SETTINGS, Entries, follow_path
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Array = np.ndarray
+# Named tuple of arrays (and of such tuples) with the problems of a batch along their first axis.
+Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 
 class LmiScalings(NamedTuple):
@@ -31,6 +34,17 @@ class LmiScalings(NamedTuple):
     X_z: Array
     X_w: Array
     G: Array
+
+
+def selected(batch: Batch, which: Array | int) -> Batch:
+    """Part of a batch, by index along the first axis of its arrays."""
+    return type(batch)(*(selected(one, which) if isinstance(one, tuple) else one[which] for one in batch))
+
+
+def joined(batches: Sequence[Batch]) -> Batch:
+    """One batch of several."""
+    columns = zip(*batches, strict=True)
+    return type(batches[0])(*(joined(ones) if isinstance(ones[0], tuple) else np.concatenate(ones) for ones in columns))
 
 
 class LinearForm:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from avis_ctrl.lti import StateSpace
-from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, dagger, residual, selected
 from avis_ctrl.robust.mu_power_kernel import FULL, search_complex
 from avis_ctrl.robust.mu_upper import block_balance, expand, rescaled
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -167,38 +167,28 @@ def next_delta(
     e = np.sum(np.conj(y) * x, axis=1)
     e = np.where(np.abs(e) < 1e-12, 1e-12, e)
     a = (dagger(M) @ y[..., None])[..., 0]
-    places = list(structure.slices())
-    g = [
-        np.zeros_like(e) if block.kind == "full" else np.sum(np.conj(a[:, w]) * x[:, z], axis=1) / e
-        for block, w, z in places
-    ]
-    size = [np.linalg.norm(a[:, w], axis=1) * np.linalg.norm(x[:, z], axis=1) for _, w, z in places]
-    C = np.zeros(M.shape[0])
-    for (block, _, _), gk, sk in zip(places, g, size, strict=True):
-        C += sk / np.abs(e) if block.kind == "full" else np.abs(gk) if block.kind == "complex" else 0.0
-    real = [gk for (block, _, _), gk in zip(places, g, strict=True) if block.kind == "real"]
-    g_real = np.stack(real, axis=1) if real else np.zeros((M.shape[0], 0), complex)
-    q = None
+    C, g = np.zeros(M.shape[0]), []
+    for block, w, z in structure.slices():
+        if block.kind == "full":
+            C += np.linalg.norm(a[:, w], axis=1) * np.linalg.norm(x[:, z], axis=1) / np.abs(e)
+            continue
+        product = np.sum(np.conj(a[:, w]) * x[:, z], axis=1) / e
+        if block.kind == "real":
+            g.append(product)
+        else:
+            C += np.abs(product)
+    q = t_fixed = None
     if slope is not None:
         q = np.einsum("bi,bij,bjk,bk->b", np.conj(y), slope, delta, x) / e
         # The multiplier must be orthogonal to the effect of the frequency.
         across = 1j * q * np.where(q.imag > 0, -1.0, 1.0)
         t_fixed = across.imag / np.maximum(across.real, 1e-9 * np.abs(q) + 1e-300)
-        step = _least_norm(g_real, C, t_fixed)
-    else:
-        step = _least_norm(g_real, C)
-    new = np.zeros_like(delta)
-    place = 0
-    for (block, w, z), gk, sk in zip(places, g, size, strict=True):
-        if block.kind == "full":
-            turn = step.k * step.phase * e / np.abs(e) / np.where(sk > 0, sk, 1.0)
-            new[:, w, z] = turn[:, None, None] * a[:, w, None] * np.conj(x[:, None, z])
-            continue
-        if block.kind == "real":
-            value, place = step.real[:, place], place + 1
-        else:
-            value = step.k * step.phase * np.conj(gk) / np.where(np.abs(gk) > 0, np.abs(gk), 1.0)
-        new[:, w, z] = value[:, None, None] * np.eye(block.rows)
+    step = _least_norm(np.stack(g, axis=1) if g else np.zeros((M.shape[0], 0), complex), C, t_fixed)
+    turn = step.k * step.phase * e / np.abs(e)
+    new = turn[:, None, None] * aligned(a, x, structure, lambda product, _: np.zeros_like(product))
+    reals = [(block.rows, w, z) for block, w, z in structure.slices() if block.kind == "real"]
+    for value, (n, w, z) in zip(step.real.T, reals, strict=True):
+        new[:, w, z] = value[:, None, None] * np.eye(n)
     shift = np.zeros(M.shape[0])
     if q is not None:
         made = np.einsum("bi,bij,bj->b", np.conj(a), new, x) / e
@@ -275,36 +265,6 @@ def scaled_to_singular(M: Array, delta: Array, structure: BlockStructure) -> Arr
         return real + factor[:, None, None] * rest
 
 
-def starts(
-    M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int, rng: np.random.Generator
-) -> Array:
-    """Initial perturbations (count, B, n_w, n_z) of norm 1/beta from the null vectors w of the upper bound's LMI."""
-    return np.stack(
-        [
-            aligned(w, (M @ w[..., None])[..., 0], structure, _least_squares) / beta[:, None, None]
-            for w in null_vectors(M, scalings, beta, structure, count, rng)
-        ]
-    )
-
-
-def null_vectors(
-    M: Array, scalings: LmiScalings, beta: Array, structure: BlockStructure, count: int, rng: np.random.Generator
-) -> Array:
-    """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
-    batch = M.shape[0]
-    F = residual(M[:, None], scalings, beta**2, np.ones(structure.n_w, bool))[:, 0]
-    values, vectors = np.linalg.eigh(scalings.X_w)
-    root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
-    _, null = np.linalg.eigh(dagger(root) @ F @ root)
-    null = root @ null
-    made = []
-    for k in range(count):
-        few = min(3, structure.n_w)
-        mix = rng.standard_normal((batch, few)) + 1j * rng.standard_normal((batch, few))
-        made.append(null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix))
-    return np.stack(made)
-
-
 def _least_squares(product: Array, square: Array) -> Array:
     return np.clip(product / np.maximum(square, 1e-300), -1, 1)
 
@@ -352,97 +312,102 @@ def lower_bound(
     If the first three starts do not reach `enough` times the upper bound, further `stages` use more starts, the last
     stage with damping. Structures without real blocks use the compiled search first.
     """
-    rng = np.random.default_rng(seed)
     batch = M.shape[0]
     # Scalings of one number per block commute with every Delta: the search uses the balanced M.
     d_z, d_w = expand(structure, block_balance(M[:, None], structure))
     M = M * d_z[:, :, None] / d_w[:, None, :]
-    scalings = rescaled(scalings, 1 / d_z, 1 / d_w, np.ones(batch))
-    best = MuLowerBound(np.zeros(batch), np.zeros((batch, structure.n_w, structure.n_z), complex))
     # An upper bound at the level of the round-off of M means mu = 0: no search.
     above_noise = upper > 1e-10 * np.linalg.norm(M, ord=2, axis=(1, 2))
+    size = np.where(above_noise, upper, 1.0)
+    search = _Search(
+        np.ascontiguousarray(M / size[:, None, None]),
+        rescaled(scalings, 1 / d_z, 1 / d_w, 1 / size),
+        structure,
+        np.random.default_rng(seed),
+        np.zeros(batch),
+        np.zeros((batch, structure.n_w, structure.n_z), complex),
+    )
     if all(block.kind != "real" for block in structure.blocks):
-        live = np.flatnonzero(above_noise)
-        if live.size:
-            _search_complex(
-                best, M, structure, upper, scalings, live, enough, SETTINGS.few if stages == 1 else SETTINGS.many, rng
-            )
+        search.complex_blocks(np.flatnonzero(above_noise), enough, SETTINGS.few if stages == 1 else SETTINGS.many)
         # Matrices without a verified perturbation go on to the slower search.
-        above_noise &= best.beta == 0.0
+        above_noise &= search.value == 0.0
     for count, iterations, damping in ((3, 20, 0.0), (6, 30, 0.0), (6, 40, 0.5))[:stages]:
-        live = np.flatnonzero(above_noise & (best.beta < enough * upper))
-        if live.size:
-            _search(best, M, structure, upper, scalings, live, count, iterations, damping, rng)
-    return best
+        search.any_blocks(np.flatnonzero(above_noise & (search.value < enough)), count, iterations, damping)
+    return MuLowerBound(search.value * size, search.delta / size[:, None, None])
 
 
-def _search_complex(
-    best: MuLowerBound,
-    M: Array,
-    structure: BlockStructure,
-    upper: Array,
-    scalings: LmiScalings,
-    live: Array,
-    enough: float,
-    count: int,
-    rng: np.random.Generator,
-) -> None:
-    """The compiled search, for structures without real blocks."""
-    size = upper[live]
-    unit = M[live] / size[:, None, None]
-    part = LmiScalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live])
-    first = null_vectors(unit, part, np.ones(live.size), structure, count, rng)
-    kinds = np.array([FULL if block.kind == "full" else 0 for block in structure.blocks])
-    w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in structure.blocks), strict=True))
-    unit = np.ascontiguousarray(unit)
-    value, found, vector = search_complex(
-        unit, first, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough, SETTINGS.settled
-    )
-    # Continue from the best start to convergence.
-    further, settled, _ = search_complex(
-        unit, vector[None], kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, np.inf, SETTINGS.settled**2
-    )
-    _keep(best, live, size, unit, np.where((further > value)[:, None, None], settled, found), structure)
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for perturbations of M (B, n_z, n_w), in units of its upper bound.
 
+    value (B,), delta (B, n_w, n_z) : the largest verified 1/||Delta|| so far, and its Delta; 0 if there is none.
+    """
 
-def _search(
-    best: MuLowerBound,
-    M: Array,
-    structure: BlockStructure,
-    upper: Array,
-    scalings: LmiScalings,
-    live: Array,
-    count: int,
-    iterations: int,
-    damping: float,
-    rng: np.random.Generator,
-) -> None:
-    size = upper[live]
-    unit = M[live] / size[:, None, None]
-    part = LmiScalings(scalings.X_z[live], scalings.X_w[live], scalings.G[live] / size[:, None, None])
-    near = np.ones(live.size, complex)
-    for delta in starts(unit, part, np.ones(live.size), structure, count, rng):
-        for sweep in range(iterations):
-            new = next_delta(unit, delta, structure, rng, near).delta
-            delta = damping * delta + (1 - damping) * new
-            if sweep % 5 == 4:
-                _keep(best, live, size, unit, new, structure)
+    M: Array
+    scalings: LmiScalings
+    structure: BlockStructure
+    rng: np.random.Generator
+    value: Array
+    delta: Array
 
+    def null_vectors(self, live: Array, count: int) -> Array:
+        """Approximate null vectors w (count, B, n_w) of the upper bound's LMI: the best three, then random mixtures."""
+        scalings = selected(self.scalings, live)
+        everywhere = np.ones(self.structure.n_w, bool)
+        F = residual(self.M[live, None], scalings, np.ones(live.size), everywhere)[:, 0]
+        values, vectors = np.linalg.eigh(scalings.X_w)
+        root = vectors / np.sqrt(np.maximum(values, 1e-300))[:, None, :]
+        _, null = np.linalg.eigh(dagger(root) @ F @ root)
+        null = root @ null
+        few = min(3, self.structure.n_w)
+        made = []
+        for k in range(count):
+            mix = self.rng.standard_normal((live.size, few)) + 1j * self.rng.standard_normal((live.size, few))
+            made.append(null[:, :, k] if k < few else np.einsum("bik,bk->bi", null[:, :, :few], mix))
+        return np.stack(made)
 
-def _keep(best: MuLowerBound, live: Array, size: Array, unit: Array, delta: Array, structure: BlockStructure) -> None:
-    """Update `best` with perturbations that are verified and better."""
-    exact = scaled_to_singular(unit, delta, structure)
-    for candidate in (exact, delta) if not np.any(_complex_part(structure)) else (exact,):
-        finite = np.all(np.isfinite(candidate), axis=(1, 2))
-        candidate = np.where(finite[:, None, None], candidate, 0.0)
-        norm = block_norm(candidate, structure)
-        good = finite & (norm > 0)
-        good[good] &= _balanced_is_singular(unit[good], candidate[good])
-        value = np.where(good, size / np.where(good, norm, 1.0), 0.0)
-        # unit is M over its upper bound: a value above the bound is round-off that passed the singularity test.
-        better = (value > best.beta[live]) & (value <= size * (1 + 1e-6))
-        best.beta[live[better]] = value[better]
-        best.delta[live[better]] = candidate[better] / size[better, None, None]
+    def complex_blocks(self, live: Array, enough: float, count: int) -> None:
+        """The compiled search, for structures without real blocks."""
+        if not live.size:
+            return
+        M, blocks = self.M[live], self.structure.blocks
+        kinds = np.array([FULL if block.kind == "full" else 0 for block in blocks])
+        w, z = (np.cumsum([0, *sizes]) for sizes in zip(*((b.rows, b.cols) for b in blocks), strict=True))
+
+        def found_from(starts: Array, enough: float, settled: float) -> tuple[Array, Array, Array]:
+            return search_complex(M, starts, kinds, w, z, SETTINGS.sweeps, SETTINGS.damping, enough, settled)
+
+        value, found, vector = found_from(self.null_vectors(live, count), enough, SETTINGS.settled)
+        # Continue from the best start to convergence.
+        further, settled, _ = found_from(vector[None], np.inf, SETTINGS.settled**2)
+        self.keep(live, np.where((further > value)[:, None, None], settled, found))
+
+    def any_blocks(self, live: Array, count: int, iterations: int, damping: float) -> None:
+        """Repeated linearisation from `count` starts."""
+        if not live.size:
+            return
+        M, near = self.M[live], np.ones(live.size, complex)
+        for w in self.null_vectors(live, count):
+            delta = aligned(w, (M @ w[..., None])[..., 0], self.structure, _least_squares)
+            for sweep in range(iterations):
+                new = next_delta(M, delta, self.structure, self.rng, near).delta
+                delta = damping * delta + (1 - damping) * new
+                if sweep % 5 == 4:
+                    self.keep(live, new)
+
+    def keep(self, live: Array, delta: Array) -> None:
+        """Take perturbations that are verified and better."""
+        exact = scaled_to_singular(self.M[live], delta, self.structure)
+        for candidate in (exact, delta) if not np.any(_complex_part(self.structure)) else (exact,):
+            finite = np.all(np.isfinite(candidate), axis=(1, 2))
+            candidate = np.where(finite[:, None, None], candidate, 0.0)
+            norm = block_norm(candidate, self.structure)
+            good = finite & (norm > 0)
+            good[good] &= _balanced_is_singular(self.M[live[good]], candidate[good])
+            value = np.where(good, 1 / np.where(good, norm, 1.0), 0.0)
+            # A value above the upper bound is round-off that passed the singularity test.
+            better = (value > self.value[live]) & (value <= 1 + 1e-6)
+            self.value[live[better]], self.delta[live[better]] = value[better], candidate[better]
 
 
 def singular_frequency(

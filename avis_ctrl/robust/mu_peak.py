@@ -22,9 +22,9 @@ from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
-from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, cover
+from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
-from avis_ctrl.robust.mu_lmi import Array
+from avis_ctrl.robust.mu_lmi import Array, joined, selected
 from avis_ctrl.robust.mu_lower import SETTINGS as LOWER
 from avis_ctrl.robust.mu_lower import MuLowerBound, lower_bound, singular_frequency
 from avis_ctrl.robust.mu_scan import first_frequencies, refine_maxima
@@ -293,40 +293,8 @@ def _in_rad_s(N: StateSpace, part: Coupled, result: MuPeak) -> MuPeak:
     )
 
 
-@dataclass
-class _Scan:
-    """Upper bounds with their scalings at the computed frequencies."""
-
-    omega: Array
-    bound: UpperBound
-    slack: float
-
-    @staticmethod
-    def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Scan:
-        omega, found = _searched(N, band, slack, lambda M: bound_of_peak(M[:, None], structure, accuracy_of(slack)))
-        order = np.argsort(omega)
-        return _Scan(omega[order], UpperBound.joined(found).at(order), slack)
-
-    def shown(self, structure: BlockStructure) -> _Scan:
-        """The part for the curves: with many blocks, whose lower bounds take long, only some of the frequencies,
-        including those of the highest values."""
-        if not structure.many:
-            return self
-        kept = _thinned(self.bound.beta, SETTINGS.points)
-        return _Scan(self.omega[kept], self.bound.at(kept), self.slack)
-
-    @property
-    def peak(self) -> Array:
-        """The frequency of the highest value as an array; the band is first split there."""
-        return self.omega[[int(np.argmax(self.bound.beta))]]
-
-    @property
-    def level(self) -> float:
-        return _level(self.bound.beta, self.slack)
-
-
-def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array], Found]) -> tuple[Array, list[Found]]:
-    """Frequencies (n,) in the order of a search for the highest values, and the results of look(M) there, in batches.
+def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array], Found]) -> tuple[Array, Found]:
+    """Frequencies (n,) of a search for the highest values, in increasing order, and the results of look(M) there.
 
     look : function of responses M (m, n_out, n_in); the first item of its result are the values (m,).
     """
@@ -339,7 +307,9 @@ def _searched(N: StateSpace, band: Interval, slack: float, look: Callable[[Array
 
     first = first_frequencies(N, band)
     refine_maxima(value, first, value(first), tolerance=accuracy_of(slack))
-    return np.concatenate([omega for omega, _ in seen]), [found for _, found in seen]
+    omega = np.concatenate([one for one, _ in seen])
+    order = np.argsort(omega)
+    return omega[order], selected(joined([found for _, found in seen]), order)
 
 
 def _thinned(values: Array, most: int) -> Array:
@@ -364,38 +334,35 @@ def _mu_peak(
 ) -> MuPeak:
     """mu_peak of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
-    scan = _Scan.of(N, structure, band, slack).shown(structure)
+    omega, bound = _searched(N, band, slack, lambda M: bound_of_peak(M[:, None], structure, accuracy))
+    if structure.many:
+        # The lower bounds of many blocks take long: only some frequencies, including those of the highest values.
+        kept = _thinned(bound.beta, SETTINGS.points)
+        omega, bound = omega[kept], selected(bound, kept)
+    level, peak = _level(bound.beta, slack), omega[[int(np.argmax(bound.beta))]]
     # One stage is enough for the curve; the search continues at the peaks only.
-    lower = lower_bound(N.frequency_response(scan.omega), structure, *scan.bound, enough=0.9, stages=1)
-    if known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * scan.level:
-        done = Cover(known_upper)
+    lower = lower_bound(N.frequency_response(omega), structure, *bound, enough=0.9, stages=1)
+    done = _cover_mu(N, structure, level, accuracy, slack)
+    if known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * level:
+        done.level = known_upper
     else:
-        done = _cover_mu(N, structure, scan.level, band, scan.peak, accuracy, slack)
-    best, at, delta = _best_singular(N, structure, scan.omega, scan.bound, lower, done, band)
+        done.run(band, peak)
+    best, at, delta = _best_singular(N, structure, omega, bound, lower, done, band)
     if best > done.level:
         # mu of real blocks can jump at a single frequency outside any grid; the search with free frequency found one.
-        done = _cover_mu(N, structure, best * (1 + slack), band, np.array([at]), accuracy, slack)
+        done = _cover_mu(N, structure, best * (1 + slack), accuracy, slack).run(band, np.array([at]))
     if best == 0.0:
-        at = float(scan.peak[0])
-    return MuPeak(
-        done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), scan.omega, scan.bound.beta, lower.beta
-    )
+        at = float(peak[0])
+    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), omega, bound.beta, lower.beta)
 
 
-def _cover_mu(
-    N: StateSpace, structure: BlockStructure, level: float, band: Interval, first: Array, accuracy: float, slack: float
-) -> Cover:
-    """Intervals on which constant scalings prove mu below a level; the band is first split at `first` (n,)."""
-    return cover(
-        N,
-        structure,
-        lambda system, level: system.scaled(left=1 / level),
-        lambda M: upper_bound(M, structure, accuracy).beta,
-        level,
-        band,
-        first,
-        slack=slack,
-    )
+def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, accuracy: float, slack: float) -> Cover:
+    """Proof, to be run, that mu is below a level on intervals with constant scalings."""
+
+    def bound(M: Array) -> Array:
+        return upper_bound(M, structure, accuracy).beta
+
+    return Cover(N, structure, lambda level: N.scaled(left=1 / level), bound, level, slack)
 
 
 def _best_singular(
@@ -410,7 +377,7 @@ def _best_singular(
     """Largest verified lower bound: thorough search at the highest peaks, with a free frequency for real blocks."""
     top = np.unique(np.concatenate([np.argsort(found.beta)[-3:], np.argsort(lower.beta)[-3:]]))
     M = N.frequency_response(omega[top])
-    hard = lower_bound(M, structure, *found.at(top), enough=0.995, seed=1)
+    hard = lower_bound(M, structure, *selected(found, top), enough=0.995, seed=1)
     values = np.maximum(hard.beta, lower.beta[top])
     deltas = np.where((hard.beta >= lower.beta[top])[:, None, None], hard.delta, lower.delta[top])
     k = int(np.argmax(values))
@@ -439,67 +406,41 @@ def _worst_case_gain(
     n_e = N.noutputs - n_z
     whole = structure.with_performance(N.ninputs - n_w, n_e)
 
-    def scaled(system: StateSpace, level: float) -> StateSpace:
-        return system.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
+    def scaled(level: float) -> StateSpace:
+        return N.scaled(left=np.r_[np.ones(n_z), np.full(n_e, 1 / level)])
+
+    def bound(M: Array) -> Array:
+        return skewed_upper_bound(M, whole, accuracy).beta
 
     # Lower bounds are cheap and tight: they show where upper bounds are worth computing.
-    reached = _Reached.of(N, structure, band, slack)
-    shown = reached.thinned(points)
-    upper = skewed_upper_bound(N.frequency_response(shown.omega)[:, None], whole, accuracy).beta
+    searched, reached = _searched(N, band, slack, lambda M: worst_gain(M, structure))
+    kept = _thinned(reached.gain, points)
+    omega = searched[kept]
+    upper = bound(N.frequency_response(omega)[:, None])
     done = None
     proved = known is not None and known.guaranteed and known.upper < 1.0
     if np.all(np.isfinite(upper)) and (proved or _robustly_stable(N.select(range(n_z), range(n_w)), structure, band)):
-        done = cover(
-            N,
-            whole,
-            scaled,
-            lambda m: skewed_upper_bound(m, whole, accuracy).beta,
-            _level(upper, slack),
-            band,
-            shown.omega[[int(np.argmax(upper))]],
-            slack=slack,
-        )
+        done = Cover(N, whole, scaled, bound, _level(upper, slack), slack).run(band, omega[[int(np.argmax(upper))]])
     if done is not None and np.isfinite(done.level):
         k = int(np.argmax(reached.gain))
         return MuPeak(
             done.level,
             float(reached.gain[k]),
-            float(reached.omega[k]),
+            float(searched[k]),
             reached.delta[k],
             not done.gaps,
             _in_words(done, band, dt),
-            shown.omega,
+            omega,
             upper,
-            shown.gain,
+            reached.gain[kept],
         )
     robust = known or _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
     if robust.lower >= 1.0:
-        return _destabilised(N, structure, robust, shown.omega)
-    gain, delta = _gain_of_stable(N.frequency_response(shown.omega), structure, robust)
+        return _destabilised(N, structure, robust, omega)
+    gain, delta = _gain_of_stable(N.frequency_response(omega), structure, robust)
     k = int(np.argmax(gain))
     words = f"robust stability is not proved: mu of the blocks is between {robust.lower:.6g} and {robust.upper:.6g}"
-    return MuPeak(np.inf, float(gain[k]), float(shown.omega[k]), delta[k], True, words, shown.omega, upper, gain)
-
-
-@dataclass(frozen=True)
-class _Reached:
-    """Lower bounds of the worst-case gain (n,), and the perturbations (n, n_w, n_z) that attain them."""
-
-    omega: Array
-    gain: Array
-    delta: Array
-
-    @staticmethod
-    def of(N: StateSpace, structure: BlockStructure, band: Interval, slack: float) -> _Reached:
-        omega, found = _searched(N, band, slack, lambda M: worst_gain(M, structure))
-        order = np.argsort(omega)
-        gain, delta = (np.concatenate(parts)[order] for parts in zip(*found, strict=True))
-        return _Reached(omega[order], gain, delta)
-
-    def thinned(self, most: int) -> _Reached:
-        """At most `most` evenly chosen frequencies, and those of the highest gains."""
-        kept = _thinned(self.gain, most)
-        return _Reached(self.omega[kept], self.gain[kept], self.delta[kept])
+    return MuPeak(np.inf, float(gain[k]), float(omega[k]), delta[k], True, words, omega, upper, gain)
 
 
 def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, omega: Array) -> MuPeak:
@@ -537,7 +478,7 @@ def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -
 def _stable_cover(N: StateSpace, structure: BlockStructure) -> Cover:
     """Cover of all frequencies at a level just below 1, if it exists; otherwise with gaps or a higher level."""
     first = first_frequencies(N, ALL_FREQUENCIES, 0)
-    return _cover_mu(N, structure, 1.0 - 1e-6, ALL_FREQUENCIES, first, accuracy=1e-4, slack=0.0)
+    return _cover_mu(N, structure, 1.0 - 1e-6, accuracy=1e-4, slack=0.0).run(ALL_FREQUENCIES, first)
 
 
 def _in_words(done: Cover, band: Interval, dt: float) -> str:

@@ -80,34 +80,6 @@ def _unit(x: Array) -> None:
 
 
 @njit(cache=True)
-def _linearised(a: Array, x: Array, e: complex, kinds: Array, w: Array, z: Array, new: Array) -> float:
-    """Fill `new` with the Delta of minimum norm k that makes the eigenvalue 1 to first order; return k, inf if none."""
-    total = 0.0
-    for b in range(kinds.size):
-        if kinds[b] == FULL:
-            total += np.sqrt(np.sum(np.abs(a[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b] : z[b + 1]]) ** 2)) / abs(e)
-        else:
-            total += abs(np.sum(np.conj(a[w[b] : w[b + 1]]) * x[z[b] : z[b + 1]])) / abs(e)
-    if not total > 1e-12:
-        return np.inf
-    k = 1.0 / total
-    new[:] = 0.0
-    for b in range(kinds.size):
-        if kinds[b] == FULL:
-            size = np.sqrt(np.sum(np.abs(a[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b] : z[b + 1]]) ** 2)) * abs(e)
-            turn = k * e / size if size > 0 else 0j
-            for i in range(w[b], w[b + 1]):
-                for j in range(z[b], z[b + 1]):
-                    new[i, j] = turn * a[i] * np.conj(x[j])
-        else:
-            g = np.sum(np.conj(a[w[b] : w[b + 1]]) * x[z[b] : z[b + 1]]) / e
-            value = k * np.conj(g) / abs(g) if abs(g) > 0 else k + 0j
-            for i in range(w[b + 1] - w[b]):
-                new[w[b] + i, z[b] + i] = value
-    return k
-
-
-@njit(cache=True)
 def _aligned(v: Array, u: Array, kinds: Array, w: Array, z: Array, delta: Array) -> None:
     """Fill `delta` with the Delta of norm 1 that best satisfies v = Delta u, block by block."""
     delta[:] = 0.0
@@ -122,6 +94,23 @@ def _aligned(v: Array, u: Array, kinds: Array, w: Array, z: Array, delta: Array)
             value = product / abs(product) if abs(product) > 0 else 1.0 + 0j
             for i in range(w[b + 1] - w[b]):
                 delta[w[b] + i, z[b] + i] = value
+
+
+@njit(cache=True)
+def _linearised(a: Array, x: Array, e: complex, kinds: Array, w: Array, z: Array, new: Array) -> float:
+    """Fill `new` with the Delta of minimum norm k that makes the eigenvalue 1 to first order; return k, inf if none."""
+    total = 0.0
+    for b in range(kinds.size):
+        if kinds[b] == FULL:
+            total += np.sqrt(np.sum(np.abs(a[w[b] : w[b + 1]]) ** 2) * np.sum(np.abs(x[z[b] : z[b + 1]]) ** 2)) / abs(e)
+        else:
+            total += abs(np.sum(np.conj(a[w[b] : w[b + 1]]) * x[z[b] : z[b + 1]])) / abs(e)
+    if not total > 1e-12:
+        return np.inf
+    k = 1.0 / total
+    _aligned(a, x, kinds, w, z, new)
+    new *= k * e / abs(e)
+    return k
 
 
 @njit(cache=True)

@@ -6,7 +6,6 @@ bound even if the optimisation did not converge.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from avis_ctrl.robust.mu_diagonal_kernel import balanced_squares, follow_diagonal, level_squares
 from avis_ctrl.robust.mu_kernel import SETTINGS as PATH
-from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, follow, least_level
+from avis_ctrl.robust.mu_lmi import Array, LmiScalings, ScalingSpace, follow, joined, least_level, selected
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -46,18 +45,6 @@ class UpperBound(NamedTuple):
 
     beta: Array
     scalings: LmiScalings
-
-    def at(self, which: Array) -> UpperBound:
-        """Part of the batch, by index."""
-        return UpperBound(self.beta[which], LmiScalings(*(one[which] for one in self.scalings)))
-
-    @staticmethod
-    def joined(parts: Sequence[UpperBound]) -> UpperBound:
-        """Concatenate several batches."""
-        return UpperBound(
-            np.concatenate([part.beta for part in parts]),
-            LmiScalings(*(np.concatenate(one) for one in zip(*(part.scalings for part in parts), strict=True))),
-        )
 
 
 def block_balance(M: Array, structure: BlockStructure, goal: Array | float = 0.0, sweeps: int = 20) -> Array:
@@ -113,11 +100,11 @@ def upper_bound(
     if _is_diagonal(structure):
         return _upper_chunk(M, structure, tolerance, goals)
     n_chunk = max(1, int(SETTINGS.batch_bytes / (32 * ScalingSpace.of(structure).form.row.size ** 2 * M.shape[1])))
-    parts = [np.arange(k, min(k + n_chunk, M.shape[0])) for k in range(0, M.shape[0], n_chunk)]
-    return UpperBound.joined(
+    chunks = [np.arange(k, min(k + n_chunk, M.shape[0])) for k in range(0, M.shape[0], n_chunk)]
+    return joined(
         [
-            _upper_chunk(M[part], structure, tolerance, goals[part], None if start is None else start.at(part))
-            for part in parts
+            _upper_chunk(M[at], structure, tolerance, goals[at], None if start is None else selected(start, at))
+            for at in chunks
         ]
     )
 
@@ -128,7 +115,7 @@ def bound_for_goal(M: Array, structure: BlockStructure, tolerance: float, goal: 
         return upper_bound(M, structure, tolerance, goal)
     found = upper_bound(M, structure.simplified(), tolerance, goal)
     if (left := np.flatnonzero(found.beta >= goal)).size:
-        _replace(found, left, upper_bound(M[left], structure, tolerance, goal, found.at(left)))
+        _replace(found, left, upper_bound(M[left], structure, tolerance, goal, selected(found, left)))
     return found
 
 
@@ -139,14 +126,14 @@ def bound_of_peak(M: Array, structure: BlockStructure, tolerance: float) -> Uppe
     found, full = upper_bound(M, structure.simplified(), tolerance), np.zeros(M.shape[0], bool)
     while not full[np.argmax(found.beta)]:
         left = np.flatnonzero(~full & (found.beta >= SETTINGS.worth * np.max(found.beta)))
-        _replace(found, left, upper_bound(M[left], structure, tolerance, start=found.at(left)))
+        _replace(found, left, upper_bound(M[left], structure, tolerance, start=selected(found, left)))
         full[left] = True
     return found
 
 
 def _replace(found: UpperBound, which: Array, better: UpperBound) -> None:
-    for whole, part in zip((found.beta, *found.scalings), (better.beta, *better.scalings), strict=True):
-        whole[which] = part
+    for whole, new in zip((found.beta, *found.scalings), (better.beta, *better.scalings), strict=True):
+        whole[which] = new
 
 
 def _upper_chunk(
@@ -235,7 +222,7 @@ def skewed_upper_bound(M: Array, structure: BlockStructure, tolerance: float = 1
         better = gain < most[left]
         for scaling, side in ((bound.scalings.X_z, r_z), (bound.scalings.X_w, r_w)):
             scaling[:, side:, side:] /= g[:, None, None] ** 2
-        _replace(found, left[better], UpperBound(gain, bound.scalings).at(better))
+        _replace(found, left[better], selected(UpperBound(gain, bound.scalings), better))
         most[left] = np.minimum(most[left], gain)
         least[left] = np.where(bound.beta > 1, np.maximum(least[left], bound.beta * g), least[left])
         left = left[most[left] > (1 + tolerance) * least[left]]

@@ -173,20 +173,8 @@ def musyn(
         )
     if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
         raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
-    made = dk_iteration(
-        P,
-        blocks,
-        nmeas,
-        ncon,
-        callback=callback,
-        target=target,
-        max_iterations=max_iterations,
-        backoff=backoff,
-        polish=polish,
-        max_added_states=max_added_states,
-        starts=starts,
-        state=state,
-    )
+    options = Options(target, max_iterations, backoff, polish, max_added_states, callback)
+    made = dk_iteration(P, blocks, nmeas, ncon, options, starts, state)
     with threadpool_limits(1, user_api="blas"):
         best, notes = made.best, tuple[str, ...]()
         if apart or (order is not None and best.K.nstates > order):
@@ -240,26 +228,17 @@ class DKIteration:
 
 
 def dk_iteration(
-    P: Any,
+    P: StateSpace,
     blocks: BlockStructure | Sequence[Block],
     nmeas: int,
     ncon: int,
-    *,
-    callback: Callable[[Iteration], Any] | None = None,
-    target: float | None = None,
-    max_iterations: int = 30,
-    backoff: float = 0.01,
-    polish: bool = True,
-    max_added_states: int | None = None,
+    options: Options,
     starts: Sequence[StateSpace] = (),
     state: dict[str, Any] | None = None,
 ) -> DKIteration:
     """The iteration of `musyn` alone, with the same parameters and errors, for callers that change the controller
     before its bounds are computed."""
-    P, nmeas, ncon = as_plant(P, nmeas, ncon)
     uncertainty, complexified = _structures(P, blocks, nmeas, ncon)
-    cap = P.nstates + 20 if max_added_states is None else max_added_states
-    options = _options(target, max_iterations, backoff, polish, cap, callback)
     problem = Problem(continuous_image(P), complexified, nmeas, ncon)
     given = tuple(continuous_image(_named(P, as_system(K, "starts"), nmeas, ncon)) for K in starts)
     with threadpool_limits(1, user_api="blas"):
@@ -267,7 +246,7 @@ def dk_iteration(
         if state is not None:
             current, known = State.from_dict(state, complexified, problem.P, nmeas, ncon, P.dt)
         current, status = iterate(problem, current, (*known, *given), options)
-        initial = initial_controllers(problem, given, backoff)
+        initial = initial_controllers(problem, given, options.backoff)
         return DKIteration(P, problem, uncertainty, current, status, initial)
 
 
@@ -297,25 +276,6 @@ def _named(P: StateSpace, K: StateSpace, nmeas: int, ncon: int) -> StateSpace:
             f"expected {clock} controllers with {nmeas} inputs and {ncon} outputs", field="starts", value=repr(K)
         )
     return K.renamed(P.outputs[P.noutputs - nmeas :], P.inputs[P.ninputs - ncon :])
-
-
-def _options(
-    target: float | None,
-    max_iterations: int,
-    backoff: float,
-    polish: bool,
-    cap: int,
-    callback: Callable[[Iteration], Any] | None,
-) -> Options:
-    if target is not None and not (np.isfinite(target) and target > 0):
-        raise InputError("expected a positive number or None", field="target", value=target)
-    if int(max_iterations) != max_iterations or max_iterations < 1:
-        raise InputError("expected a whole number of at least 1", field="max_iterations", value=max_iterations)
-    if not (np.isfinite(backoff) and 0 <= backoff < 1):
-        raise InputError("expected a number from 0 to below 1", field="backoff", value=backoff)
-    if cap < 0:
-        raise InputError("expected a number of at least 0", field="max_added_states", value=cap)
-    return Options(target, int(max_iterations), backoff, polish, int(cap), callback)
 
 
 def _certificate(problem: Problem, best: Loop, closed: StateSpace) -> tuple[Scalings, float]:

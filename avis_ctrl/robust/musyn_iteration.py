@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti import StateSpace, gain, hinf_norm, lft_lower
+from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.robust.dstep import SETTINGS as D_STEP
 from avis_ctrl.robust.dstep import PointwiseScalings, band_of, d_steps, equal_order_fits
 from avis_ctrl.robust.frequency_grid import frequency_grid, refined_grid
@@ -69,14 +69,28 @@ SETTINGS = IterationSettings()
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `musyn`."""
+    """Options of `musyn`; max_added_states None: 20 more than the states of the plant. InputError for wrong values."""
 
-    target: float | None
-    max_iterations: int
-    backoff: float
-    polish: bool
-    max_added_states: int
-    callback: Callable[[Iteration], Any] | None
+    target: float | None = None
+    max_iterations: int = 30
+    backoff: float = 0.01
+    polish: bool = True
+    max_added_states: int | None = None
+    callback: Callable[[Iteration], Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.target is not None and not (np.isfinite(self.target) and self.target > 0):
+            raise InputError("expected a positive number or None", field="target", value=self.target)
+        if int(self.max_iterations) != self.max_iterations or self.max_iterations < 1:
+            raise InputError("expected a whole number of at least 1", field="max_iterations", value=self.max_iterations)
+        if not (np.isfinite(self.backoff) and 0 <= self.backoff < 1):
+            raise InputError("expected a number from 0 to below 1", field="backoff", value=self.backoff)
+        if self.max_added_states is not None and self.max_added_states < 0:
+            raise InputError("expected a number of at least 0", field="max_added_states", value=self.max_added_states)
+
+    def added_states(self, problem: Problem) -> int:
+        """Maximum number of states that the scalings may add to the plant."""
+        return problem.P.nstates + 20 if self.max_added_states is None else int(self.max_added_states)
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +224,7 @@ def _k_step(problem: Problem, state: State, options: Options) -> tuple[Proposal,
     hint = state.path.gamma
     if state.phase == "D-K":
         enough = (1 - SETTINGS.stall) * state.path.mu / (1 + options.backoff)
-        if found := _best(problem, _equal_orders(state, options), options, hint, enough):
+        if found := _best(problem, _equal_orders(problem, state, options), options, hint, enough):
             return found
     return _best(problem, _proposed(problem, state, options), options, hint)
 
@@ -265,11 +279,11 @@ class Proposal(NamedTuple):
     kind: str
 
 
-def _equal_orders(state: State, options: Options) -> Iterator[Proposal]:
+def _equal_orders(problem: Problem, state: State, options: Options) -> Iterator[Proposal]:
     """Scalings of equal order in all blocks; their cost is measured on the grid only."""
     assert state.points is not None
     try:
-        for step in equal_order_fits(state.points, options.max_added_states):
+        for step in equal_order_fits(state.points, options.added_states(problem)):
             yield Proposal(step.scalings, max(0.0, step.cost), "D-K")
     except np.linalg.LinAlgError:
         return
@@ -291,7 +305,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
                 lft_lower(problem.P, state.last.K),
                 state.last.scalings,
                 floors if _falls_fast(state) else floors[::-1],
-                max_states=options.max_added_states,
+                max_states=options.added_states(problem),
             ):
                 yield Proposal(step.scalings, step.cost, "D-K")
         except np.linalg.LinAlgError:
@@ -301,7 +315,7 @@ def _proposed(problem: Problem, state: State, options: Options) -> Iterator[Prop
     band = band_of(state.points.omega)
     start = min(state.last, state.path, key=lambda loop: loop.gamma).scalings
     if state.phase == "growth":
-        larger = with_added_pairs(problem.P, problem.nmeas, problem.ncon, start, band, options.max_added_states)
+        larger = with_added_pairs(problem.P, problem.nmeas, problem.ncon, start, band, options.added_states(problem))
         if larger is None:
             return
         start = larger
@@ -317,14 +331,7 @@ def _at_rest(problem: Problem, omega: np.ndarray, mu: float) -> bool:
     With K = 0 the actuator uncertainty receives no signal and all D-scalings are equivalent: no D-step can improve it.
     """
     P = problem.P
-    at_rest = lft_lower(
-        P,
-        gain(
-            np.zeros((problem.ncon, problem.nmeas)),
-            P.outputs[P.noutputs - problem.nmeas :],
-            P.inputs[P.ninputs - problem.ncon :],
-        ),
-    )
+    at_rest = P.select(slice(P.noutputs - problem.nmeas), slice(P.ninputs - problem.ncon))
     if not at_rest.is_stable():
         return False
     open_loop = upper_bound(at_rest.frequency_response(omega)[:, None], problem.structure, 1e-3).beta

@@ -61,7 +61,7 @@ def solve_riccati(
     if n == 0:
         return RiccatiSolution(np.zeros((0, 0)), True)
     scale = symplectic_scale(A, R, Q)
-    a, r, q = A / scale[:, None] * scale, R / np.outer(scale, scale), Q * np.outer(scale, scale)
+    a, r, q = _rescaled(scale, A, R, Q)
     H = np.block([[a, r], [-q, -a.T]])
     if not np.all(np.isfinite(H)):
         return RiccatiSolution(None, False, "the Hamiltonian overflows")
@@ -90,11 +90,16 @@ def solve_riccati(
         return RiccatiSolution(X, True)
     error = None
     if noise is not None:
-        both = np.outer(scale, scale)
-        a, r, q = noise[0] / scale[:, None] * scale, noise[1] / both, noise[2] * both
+        a, r, q = _rescaled(scale, *noise)
         error = np.block([[a, r], [q, a.T]])
     indefinite = negative_beyond_error(H, U[:, :n], error)
     return RiccatiSolution(X, not indefinite, doubtful=not indefinite)
+
+
+def _rescaled(d: np.ndarray, A: np.ndarray, R: np.ndarray, Q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(A, R, Q) for the states x / d; entries and their error bounds scale alike."""
+    both = np.outer(d, d)
+    return A / d[:, None] * d, R / both, Q * both
 
 
 def refined(
@@ -125,9 +130,7 @@ def refined_balanced(
     """`refined` after a symplectic balancing of the states, which reduces the effect of round-off."""
     d = symplectic_scale(A, R, Q)
     both = np.outer(d, d)
-    if noise is not None:
-        noise = noise[0] / d[:, None] * d, noise[1] / both, noise[2] * both
-    found = refined(A / d[:, None] * d, R / both, Q * both, X * both, noise)
+    found = refined(*_rescaled(d, A, R, Q), X * both, None if noise is None else _rescaled(d, *noise))
     return None if found is None else (found[0] / both, found[1] / both)
 
 

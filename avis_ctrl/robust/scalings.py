@@ -15,6 +15,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import StateSpace, gain
+from avis_ctrl.lti.rational import log_modulus
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -155,10 +156,6 @@ class ScalarScaling:
             C[:, here] = c
         return A, B, C, D
 
-    def realise(self) -> StateSpace:
-        """d(s) as a state-space system."""
-        return StateSpace(*self.matrices)
-
     def as_dict(self) -> dict[str, Any]:
         """Content for a JSON file."""
         return {"theta": self.theta.tolist()}
@@ -198,20 +195,9 @@ def _roots(theta: np.ndarray) -> np.ndarray:
 
 
 def _log_modulus(theta: np.ndarray, omega: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """log |product of factors at j omega| (n_omega,) and its derivative with respect to theta (n_omega, n)."""
-    omega = np.atleast_1d(np.asarray(omega, float))
-    value, slope = np.zeros(omega.size), np.zeros((omega.size, theta.size))
-    for k in range(theta.size // 2):
-        w2, c = np.exp(2 * theta[2 * k]), 4 * np.exp(2 * theta[2 * k + 1])
-        size = (w2 - omega**2) ** 2 + c * w2 * omega**2
-        value += 0.5 * np.log(size)
-        slope[:, 2 * k] = (2 * w2 * (w2 - omega**2) + c * w2 * omega**2) / size
-        slope[:, 2 * k + 1] = c * w2 * omega**2 / size
-    if theta.size % 2:
-        a2 = np.exp(2 * theta[-1])
-        value += 0.5 * np.log(omega**2 + a2)
-        slope[:, -1] = a2 / (omega**2 + a2)
-    return value, slope
+    """`log_modulus` of the zeros or of the poles: pairs, then a single real root if their number is odd."""
+    n = theta.size // 2
+    return log_modulus(theta[: 2 * n].reshape(n, 2), theta[2 * n :], np.atleast_1d(omega))
 
 
 def _section(zeros: np.ndarray, poles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

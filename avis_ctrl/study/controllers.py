@@ -15,6 +15,7 @@ from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
+from avis_ctrl.robust.musyn_iteration import Options
 from avis_ctrl.robust.reduction import reduce_controller, replace_fast_by_lags, residualise_fast, truncate_slow
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
@@ -85,11 +86,13 @@ def mu_optimal(
         P.blocks,
         P.nmeas,
         P.ncon,
-        callback=callback,
-        target=asked.target_mu,
-        polish=asked.polish is not False,
-        max_iterations=asked.max_iterations,
-        backoff=asked.backoff_percent / 100,
+        Options(
+            asked.target_mu,
+            asked.max_iterations,
+            asked.backoff_percent / 100,
+            asked.polish is not False,
+            callback=callback,
+        ),
         starts=[one.K for one in rivals if one.K is not None],
     )
     K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100, design.control_effort.offset_corner_Hz)

@@ -83,10 +83,14 @@ class RealParameter(Element):
         skew = (2 * self.nominal - self.high - self.low) / width
         return skew if abs(skew) > 1e-14 * (abs(self.high) + abs(self.low)) / width else 0.0
 
+    @property
+    def _line(self) -> tuple[float, float]:
+        """a, b in value = (nominal + b delta)/(1 + a delta)."""
+        return self.skew, self.high + self.skew * self.high - self.nominal
+
     def lft(self) -> np.ndarray:
         """(2, 2): value = F_u of this matrix and delta."""
-        a = self.skew
-        b = self.high + a * self.high - self.nominal
+        a, b = self._line
         # n + (b - n a) delta/(1 + a delta); both channels get the same size.
         change = b - self.nominal * a
         size = np.sqrt(abs(change))
@@ -94,19 +98,14 @@ class RealParameter(Element):
 
     def delta(self, value: float) -> float:
         """The normalised delta of a value."""
-        a = self.skew
-        b = self.high + a * self.high - self.nominal
+        a, b = self._line
         return (value - self.nominal) / (b - a * value)
 
     def value(self, delta: float) -> float:
         """The value of a normalised delta; inf at delta = -1/skew, and beyond it."""
-        a = self.skew
+        a, b = self._line
         below = 1 + a * delta
-        return (
-            (self.nominal + (self.high + a * self.high - self.nominal) * delta) / below
-            if below > SETTINGS.pole
-            else np.inf
-        )
+        return (self.nominal + b * delta) / below if below > SETTINGS.pole else np.inf
 
     def __str__(self) -> str:
         up, down = self.high - self.nominal, self.nominal - self.low

@@ -13,15 +13,7 @@ from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.lti.statespace import StateSpace, as_names
 from avis_ctrl.lti.statespace import tf as tf_of_numbers
 from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
-from avis_ctrl.uncertainty.uncertain_system import (
-    STATES,
-    UncertainSystem,
-    as_uncertain,
-    hstacked,
-    ordered,
-    reduced,
-    vstacked,
-)
+from avis_ctrl.uncertainty.uncertain_system import STATES, UncertainSystem, as_uncertain, ordered, reduced, stacked
 
 
 def real(
@@ -125,8 +117,7 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
     table = [list(row) if isinstance(row, (list, tuple, np.ndarray)) else [row] for row in rows]
     if not table or len({len(row) for row in table}) != 1:
         raise InputError("expected rows of one length", field="matrix", value=[len(row) for row in table])
-    stacked = [hstacked([as_uncertain(one) for one in row]) for row in table]
-    return reduced(vstacked(stacked))
+    return reduced(stacked([stacked([as_uncertain(one) for one in row], 1) for row in table], 0))
 
 
 def ss(
@@ -176,7 +167,7 @@ def ss(
         d = as_uncertain(np.zeros((c.shape[0], b.shape[1])))
     if a.shape != (n, n) or b.shape[0] != n or c.shape[1] != n or d.shape != (c.shape[0], b.shape[1]):
         raise InputError(f"shapes do not fit: A {a.shape}, B {b.shape}, C {c.shape}, D {d.shape}")
-    M = reduced(vstacked([hstacked([a, b]), hstacked([c, d])]))
+    M = reduced(stacked([stacked([a, b], 1), stacked([c, d], 1)], 0))
     return _of_matrix(M, n, dt, inputs, outputs, states)
 
 
@@ -226,7 +217,7 @@ def tf(
     output = num[0] * last * highest + matrix([[*(b * p for b, p in zip(num[:0:-1], powers, strict=True)), 0.0]])
     shift = [as_uncertain(size * np.eye(n - 1, n + 1, 1))] if n > 1 else []
     state = [highest] if n else []
-    return _of_matrix(reduced(vstacked([*shift, *state, output])), n, dt, inputs, outputs, ())
+    return _of_matrix(reduced(stacked([*shift, *state, output], 0)), n, dt, inputs, outputs, ())
 
 
 def connect(parts: Mapping[str, Any] | Sequence[Any], inputs: Sequence[str], outputs: Sequence[str]) -> Any:

@@ -19,9 +19,18 @@ import scipy.linalg as la
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
-from avis_ctrl.lti.interconnection import Quadruple, feedback, inverse, parallel, return_difference, series, singular
+from avis_ctrl.lti.interconnection import (
+    Quadruple,
+    feedback,
+    inverse,
+    parallel,
+    return_difference,
+    scaled_condition,
+    series,
+)
 from avis_ctrl.lti.statespace import (
     StateSpace,
+    common_dt,
     default_names,
     names_of_inverse,
     new_names,
@@ -250,9 +259,7 @@ class UncertainSystem:
                     raise InputError(
                         f"expected {element.rows} outputs and {element.cols} inputs", field=name, value=delta.D.shape
                     )
-                inner = as_uncertain(delta)
-                for _ in range(n - 1):
-                    inner = _diagonal(inner, as_uncertain(delta))
+                inner = _repeated(as_uncertain(delta), n)
             else:
                 inner = as_uncertain(delta * np.eye(n * element.rows, n * element.cols))
             system = _close(system, place, inner, w, z)
@@ -319,7 +326,7 @@ class UncertainSystem:
         """The inverse. ComputationError if the nominal value is not invertible."""
         if self.shape[0] != self.shape[1]:
             raise InputError("expected as many inputs as outputs", field="inverse", value=self.shape)
-        if singular(self.d, SETTINGS.singular):
+        if scaled_condition(self.d) > SETTINGS.singular:
             raise ComputationError(
                 "the nominal value cannot be inverted",
                 measured=f"D = {self.d.tolist()}",
@@ -412,66 +419,37 @@ def as_uncertain(given: Any) -> UncertainSystem:
     return UncertainSystem(P.A, P.B, P.C, P.D, (STATES,) * bool(n), (n,) * bool(n), P.dt, P.inputs, P.outputs, P.states)
 
 
-def _diagonal(X: UncertainSystem, Y: UncertainSystem) -> UncertainSystem:
-    parts = tuple(la.block_diag(p, q) for p, q in ((X.a, Y.a), (X.b, Y.b), (X.c, Y.c), (X.d, Y.d)))
-    return ordered(parts, _kinds(X, Y), _clock(X, Y), (), (), X.states + Y.states)
+def _repeated(X: UncertainSystem, n: int, names: tuple[str, ...] = ()) -> UncertainSystem:
+    """X I_n; names : (n,) of both sides, by default u0.. and y0.."""
+    parts = tuple(la.block_diag(*[one] * n) for one in X.matrices)
+    return ordered(parts, _kinds(*[X] * n), X.dt, names, names, X.states * n)
 
 
-def _repeated(X: UncertainSystem, n: int, names: tuple[str, ...]) -> UncertainSystem:
-    """X I_n of a system with one input and one output; names : (n,) of both sides."""
-    result = X
-    for _ in range(n - 1):
-        result = _diagonal(result, X)
-    return replace(result, inputs=names, outputs=names)
-
-
-def hstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
-    """[X Y ...]: outputs added, separate inputs."""
-    result = systems[0]
-    for X in systems[1:]:
-        if X.shape[0] != result.shape[0]:
-            raise InputError("expected blocks of as many rows", field="matrix", value=[one.shape for one in systems])
-        parts = (
-            la.block_diag(result.a, X.a),
-            la.block_diag(result.b, X.b),
-            np.hstack([result.c, X.c]),
-            np.hstack([result.d, X.d]),
-        )
-        result = ordered(parts, _kinds(result, X), _clock(result, X), (), (), result.states + X.states)
-    return result
-
-
-def vstacked(systems: Sequence[UncertainSystem]) -> UncertainSystem:
-    """[X; Y; ...]: outputs stacked, common inputs."""
-    result = systems[0]
-    for X in systems[1:]:
-        if X.shape[1] != result.shape[1]:
-            raise InputError("expected blocks of as many columns", field="matrix", value=[one.shape for one in systems])
-        parts = (
-            la.block_diag(result.a, X.a),
-            np.vstack([result.b, X.b]),
-            la.block_diag(result.c, X.c),
-            np.vstack([result.d, X.d]),
-        )
-        result = ordered(parts, _kinds(result, X), _clock(result, X), (), (), result.states + X.states)
-    return result
+def stacked(systems: Sequence[UncertainSystem], axis: int) -> UncertainSystem:
+    """[X; Y; ...] (axis 0): outputs stacked, common inputs; [X Y ...] (axis 1): outputs added, separate inputs."""
+    if len(systems) == 1:
+        return systems[0]
+    if len({one.shape[1 - axis] for one in systems}) > 1:
+        what = ("columns", "rows")[axis]
+        raise InputError(f"expected blocks of as many {what}", field="matrix", value=[one.shape for one in systems])
+    a, b, c, d = zip(*(one.matrices for one in systems), strict=True)
+    parts = (
+        la.block_diag(*a),
+        la.block_diag(*b) if axis else np.vstack(b),
+        np.hstack(c) if axis else la.block_diag(*c),
+        np.concatenate(d, axis),
+    )
+    return ordered(parts, _kinds(*systems), common_dt(*systems), (), (), sum((one.states for one in systems), ()))
 
 
 def _kinds(*systems: UncertainSystem) -> list[tuple[Element, int]]:
     return [pair for one in systems for pair in zip(one.elements, one.copies, strict=True)]
 
 
-def _clock(*systems: UncertainSystem) -> float:
-    clocks = {one.dt for one in systems if one.nstates} or {0.0}
-    if len(clocks) > 1:
-        raise InputError(f"systems of different sample times cannot be connected: {sorted(clocks)} s")
-    return clocks.pop()
-
-
 def _of_both(
     parts: Quadruple, X: UncertainSystem, Y: UncertainSystem, inputs: Sequence[str], outputs: Sequence[str]
 ) -> UncertainSystem:
-    return reduced(ordered(parts, _kinds(X, Y), _clock(X, Y), tuple(inputs), tuple(outputs), X.states + Y.states))
+    return reduced(ordered(parts, _kinds(X, Y), common_dt(X, Y), tuple(inputs), tuple(outputs), X.states + Y.states))
 
 
 def ordered(
@@ -542,7 +520,7 @@ def _close(system: UncertainSystem, place: int, inner: UncertainSystem, w: slice
     return ordered(
         (out[:, : n + m], out[:, n + m :], y[:, : n + m], y[:, n + m :]),
         kinds,
-        _clock(system, inner),
+        common_dt(system, inner),
         system.inputs,
         system.outputs,
         system.states + inner.states,

@@ -20,7 +20,7 @@ from avis_ctrl.lti import (
 )
 from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu
-from avis_ctrl.robust.mu_cover import cover
+from avis_ctrl.robust.mu_cover import Cover
 from avis_ctrl.robust.mu_gain import worst_gain
 from avis_ctrl.robust.mu_lmi import residual
 from avis_ctrl.robust.mu_peak import mu_peak, stability_bound, worst_case_gain
@@ -300,17 +300,14 @@ def test_a_proof_that_takes_too_long_is_given_up_and_says_so(rng):
     N = flexible(rng, 3, 3, modes=10)
     structure = BlockStructure.of([R(), R(), R()])
     bound = mu(N.frequency_response(np.abs(N.poles())), structure).upper
-    done = cover(
+    done = Cover(
         N,
         structure,
-        lambda system, level: system.scaled(left=1 / level),
+        lambda level: N.scaled(left=1 / level),
         lambda M: upper_bound(M, structure, 1e-4).beta,
         0.5 * float(np.max(bound)),
-        (0.0, np.inf),
-        np.abs(N.poles()),
-        slack=5e-4,
-        rounds=2,
-    )
+        5e-4,
+    ).run((0.0, np.inf), np.abs(N.poles()), rounds=2)
     assert done.gaps and all(low < high for low, high in done.gaps)
     found = mu_peak(N, structure)
     assert found.guaranteed and found.lower <= found.upper
