@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,7 +83,7 @@ def gap_axis(
     values = (*found.parameters.items(), *found.ratios.items())
     terminal.print(*(f"{name} = {one}" for name, one in values), markup=False)
     for stage in found.stages:
-        noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
+        noise = "" if isnan(stage.chi2_per_dof) else f", chi2/dof {stage.chi2_per_dof:.4g}"
         error = f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}"
         terminal.print(error, soft_wrap=True, markup=False)
     if folder:

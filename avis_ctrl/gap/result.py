@@ -53,7 +53,7 @@ class NamedEffect:
         return {
             "name": self.name,
             "location": self.location,
-            "parameters": {key: {"value": p.value, "std": p.std, "unit": p.unit} for key, p in self.parameters.items()},
+            "parameters": {key: p.to_json() for key, p in self.parameters.items()},
             "probability": self.probability,
             "indistinguishable_from": list(self.indistinguishable_from),
             **({} if self.share is None else {"share": self.share}),
@@ -144,6 +144,10 @@ class Where:
     excess: float = float("nan")
     p_value: float = float("nan")
 
+    def to_json(self) -> dict[str, float | str]:
+        """As defined in the contract."""
+        return {name: getattr(self, name) for name in ("from_Hz", "to_Hz", "input", "output", "share")}
+
 
 @dataclass(frozen=True, eq=False)
 class Considered:
@@ -230,8 +234,33 @@ class RecordGap:
     kind: str = ""
 
 
+class Findings:
+    """What the results of a table and of one axis have in common."""
+
+    verdict: Verdict
+    effects: tuple[NamedEffect, ...]
+    traces: tuple[NamedEffect, ...]
+    stages: tuple[Stage, ...]
+    remaining: tuple[Where, ...]
+    left: Remainder | None
+    next_experiment: str | None
+
+    def findings(self) -> dict[str, Any]:
+        """The keys of gap.json that do not depend on the kind of result."""
+        where = [one.to_json() for one in self.remaining]
+        return {
+            "verdict": self.verdict,
+            "effects": [one.to_json() for one in self.effects],
+            "traces": [one.to_json() for one in self.traces],
+            "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
+            "where": where,
+            "remaining": self.left and {**vars(self.left), "where": where},
+            "next_experiment": self.next_experiment,
+        }
+
+
 @dataclass(frozen=True, eq=False)
-class Gap:
+class Gap(Findings):
     """The complete result.
 
     Attributes
@@ -280,28 +309,8 @@ class Gap:
         return {
             "format": "avis-gap",
             "version": 1,
-            "verdict": self.verdict,
-            "effects": [one.to_json() for one in self.effects],
-            "traces": [one.to_json() for one in self.traces],
-            "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": _places(self.remaining if self.verdict != "none" else ()),
-            "remaining": None
-            if self.left is None
-            else {
-                "nrmse": self.left.nrmse,
-                "over_noise": self.left.over_noise,
-                "share": self.left.share,
-                "where": _places(self.remaining),
-                "grows_with_level": self.left.grows_with_level,
-            },
+            **self.findings(),
+            **({"where": []} if self.verdict == "none" else {}),
             "tolerances": [one.to_json() for one in self.tolerances],
-            "next_experiment": self.next_experiment,
             "seconds": self.seconds,
         }
-
-
-def _places(places: Sequence[Where]) -> list[dict[str, Any]]:
-    return [
-        {"from_Hz": one.from_Hz, "to_Hz": one.to_Hz, "input": one.input, "output": one.output, "share": one.share}
-        for one in places
-    ]

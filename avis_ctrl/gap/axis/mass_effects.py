@@ -96,18 +96,19 @@ def _attached(s: np.ndarray, p: np.ndarray) -> np.ndarray:
     return p[0] * s**2 * inner / (s**2 + inner)
 
 
+def _of_direction(
+    scale: Scale, make: Callable[..., Effect], symbol: str, force: Callable[[np.ndarray], np.ndarray]
+) -> list[Effect]:
+    """A friction as function of the direction of motion, 1 or -1; rounded, for slow motion through rest, where no real
+    friction jumps. make : the effect without its force."""
+    speed, seeds = _shape("v_rounded", "{x}/s", scale.speed), _falling(scale.speed, 10)[1::2]
+    rounded = (symbol, "{F}", lambda m, speed: force(np.tanh(m.v / speed)))
+    return [make((symbol, "{F}", lambda m: force(m.sign))), make(rounded, law="rounded", shaped_by=speed, seeds=seeds)]
+
+
 def _coulomb(scale: Scale, title: str, separated_by: str, location: str) -> list[Effect]:
-    """Friction of constant size; rounded, for slow motion through rest, where no real friction jumps."""
-    friction = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
-    return [
-        friction(("Fc", "{F}", lambda m: m.sign)),
-        friction(
-            ("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)),
-            law="rounded",
-            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
-            seeds=_falling(scale.speed, 10)[1::2],
-        ),
-    ]
+    make = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
+    return _of_direction(scale, make, "Fc", lambda direction: direction)
 
 
 def _delay(s: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -248,20 +249,11 @@ def drive_effects(scale: Scale) -> list[Effect]:
             RELEASED,
             ("offset", "{F}", lambda m: np.ones_like(m.v)),
         ),
-        at(
-            "coulomb_asymmetry",
-            "Coulomb friction that differs between the two directions",
-            RELEASED,
-            ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2),
-        ),
-        at(
-            "coulomb_asymmetry",
-            "Coulomb friction that differs between the two directions",
-            RELEASED,
-            ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2),
-            law="rounded",
-            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
-            seeds=_falling(scale.speed, 10)[1::2],
+        *_of_direction(
+            scale,
+            partial(at, "coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED),
+            "Fc_ahead_less_back",
+            lambda direction: np.abs(direction) / 2,
         ),
         at(
             "viscous_asymmetry",

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Problem
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.single_axis.identify import distinct, responses_of
@@ -57,14 +55,13 @@ class SensorModel(AxisModel):
 
     lines: Channels
 
-    def _predicted(self, pairs: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """(pairs, outputs)"""
-        c, base = self.lines, len(self.base)
+    def predicted(self, block: SpectralBlock) -> np.ndarray:
+        c, pairs = self.lines, self.lines.rows[block.name]
         rows = (2 * pairs[:, None] + np.arange(2)).ravel()
         s = 2j * np.pi * c.f[rows]
-        model = response(c.f[rows], tuple(name for name, _ in self.base), values[:base])
+        model = response(c.f[rows], tuple(name for name, _ in self.base), self.values[: len(self.base)])
         H = [np.asarray(model[kind], complex) for kind in c.names]
-        for one, p in zip(self.effects, split(values, self.effects, base), strict=True):
+        for one, p in zip(self.effects, self.parts, strict=True):
             assert one.channel is not None
             H = [
                 h * one.channel(s, p) if one.location in (kind, "drive") else h
@@ -74,19 +71,12 @@ class SensorModel(AxisModel):
         parts = 1 + np.stack([found.real, found.imag], axis=2).reshape(len(rows), -1)
         return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
 
+    def steps(self) -> np.ndarray:
+        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
+        return np.maximum(1e-5 * np.abs(self.values), least)
+
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         return np.zeros((*block.Y.shape[:2], 1))  # an error that is constant over the band is a gain, which is free
-
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        rows = self.lines.rows[block.name]
-        Y = self._predicted(rows, self.values)
-        if not derivative:
-            return Prediction(Y[:, :, None], np.empty((0, *Y.shape, 1)))
-        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
-        dY = central_differences(
-            partial(self._predicted, rows), self.values, np.maximum(1e-5 * np.abs(self.values), least)
-        )
-        return Prediction(Y[:, :, None], np.array(dY)[..., None])
 
 
 def seismometer(
@@ -169,8 +159,8 @@ def seismometer(
         positive,
         sensor_effects(f, names),
         float(np.sum(measured_noise[rows["held out"]])) / power,
+        tuple(notes),
         {"F": "", "x": "", "input": "drive", "output": outputs},
-        notes=tuple(notes),
     )
 
 
