@@ -230,8 +230,8 @@ def _gap(
     closed = found.after <= max(settings.within_noise * found.floor, found.floor + settings.small**2)
     kinds: tuple[Verdict, Verdict] = ("partly explained", "explained") if reported else ("unexplained", "none")
     base_values = {
-        name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])), unit.format(**problem.units))
-        for k, (name, unit) in enumerate(best.model.base)
+        p.name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])), p.unit.format(**problem.units))
+        for k, p in enumerate(best.model.base)
     }
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
     unknown = next((one.title for fitted in (best, free) if fitted for one in fitted.model.effects if one.outside), "")
@@ -329,7 +329,7 @@ def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str,
 def _plain(fitted: Fitted) -> dict[str, Any]:
     model = fitted.model
     return {
-        "base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
+        "base": {p.name: float(value) for p, value in zip(model.base, model.values, strict=False)},
         "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects if not one.outside],
     }
 

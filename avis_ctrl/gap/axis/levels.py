@@ -21,6 +21,7 @@ from scipy import signal
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Problem
+from avis_ctrl.gap.axis.records import block_of
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -30,7 +31,6 @@ from avis_ctrl.measurement.frequency_response.resonance import resonance
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 
 RAYLEIGH = 4 / (3 * np.pi)
-REST = ("r", "b0", "b1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +256,7 @@ def _problem(
         for out in (False, True):
             at = held == out
             name = f"{'held out' if out else 'fitted'} {level}"
-            blocks[out].append(
-                SpectralBlock(
-                    name, omega[at], np.zeros((int(at.sum()), 0, 1)), response.value[at, i, j][:, None, None]
-                ).with_noise(variance[at][:, None, None])
-            )
+            blocks[out].append(block_of(name, omega[at], response.value[at, i, j][:, None], variance[at][:, None]))
             if out:
                 noise.append(variance[at])
     change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
@@ -274,9 +270,9 @@ def _problem(
     X = np.column_stack([2j * zeta * w**2 / (s**2 + 2 * zeta * w * s + w**2), np.ones(n), omega / middle - 1])
     c = np.linalg.lstsq(X, low.value[:, i, j] / size, rcond=None)[0]
     base = (
-        ("frequency_Hz", "Hz"),
-        ("damping", "1"),
-        *((f"{name}_{part}", "1") for name in REST for part in ("real", "imaginary")),
+        Parameter("frequency_Hz", "Hz", linear=False),
+        Parameter("damping", "1", linear=False),
+        *(Parameter(f"{name}_{part}", "1") for name in ("r", "b0", "b1") for part in ("real", "imaginary")),
     )
     start = np.concatenate([[f0, zeta], np.stack([c.real, c.imag], axis=1).ravel()])
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in data[True].blocks]))
@@ -288,7 +284,6 @@ def _problem(
     return Problem(
         "levels",
         ModeModel(lines, base, (), start),
-        (True, True, *(False,) * 6),
         level_effects(scatter > settings.static * change),
         float(np.mean(noise)) / whole,
         notes,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 from scipy import signal
 
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_effects, unnamed_forces
-from avis_ctrl.gap.axis.model import MassModel, Problem
+from avis_ctrl.gap.axis.model import MassModel, Parameter, Problem
 from avis_ctrl.gap.axis.records import Lines, Signals
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 
@@ -55,8 +56,7 @@ def drive(
     scale = Scale.of(lines, pitches=True)
     return Problem(
         "drive",
-        MassModel(lines, (("M", "{F} s^2/{x}"), ("Fv", "{F} s/{x}")), (), start),
-        (True, False),
+        MassModel(lines, (_positive("M", "{F} s^2/{x}"), Parameter("Fv", "{F} s/{x}")), (), start),
         [*drive_effects(scale), *unnamed_forces(lines)],
         *repeated(lines),
         {"F": "N", "x": "m", "input": "position", "output": "force"},
@@ -108,16 +108,19 @@ def oscillator(
         return found
 
     scale = Scale.of(lines, pitches=False)
+    base = _positive("m", "{F} s^2/{x}"), Parameter("d", "{F} s/{x}"), _positive("k", "{F}/{x}")
     return Problem(
         "oscillator",
-        MassModel(lines, (("m", "{F} s^2/{x}"), ("d", "{F} s/{x}"), ("k", "{F}/{x}")), (), start),
-        (True, False, True),
+        MassModel(lines, base, (), start),
         [*oscillator_effects(scale), *unnamed_forces(lines)],
         *repeated(lines),
         {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})},
         ratios,
         {"scale": asdict(scale), "rate_Hz": rate},
     )
+
+
+_positive = partial(Parameter, linear=False)
 
 
 def _least_squares(

@@ -241,6 +241,7 @@ def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
 def drive_effects(scale: Scale) -> list[Effect]:
     """Library of effects for a drive."""
     at = partial(_force, location="drive")
+    spring, friction = partial(at, variable="position"), partial(at, low=0.0, variable="velocity")
     found = [
         *_coulomb(scale, "Coulomb friction, a force of constant size against the motion", SLOW, "drive"),
         at(
@@ -261,36 +262,30 @@ def drive_effects(scale: Scale) -> list[Effect]:
             "several constant speeds in each direction",
             ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2),
         ),
-        at(
+        friction(
             "quadratic_drag",
             "a drag that grows with the square of the speed",
             "several constant speeds",
             ("c2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
-            low=0.0,
-            variable="velocity",
         ),
-        at(
+        spring(
             "stiffness",
             "a spring to the ground (a cable, a hose)",
             AT_REST,
             ("k", "{F}/{x}", lambda m: m.q),
             ("force_at_zero", "{F}", lambda m: np.ones_like(m.q)),
-            variable="position",
         ),
-        at(
+        spring(
             "cubic_stiffness",
             "a spring that stiffens with the cube of the displacement from mid travel",
             AT_REST,
             ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3),
-            variable="position",
         ),
-        at(
+        friction(
             "stribeck_friction",
             "Stribeck friction, which falls as the drive starts to move",
             SLOW,
             ("Fs", "{F}", lambda m, speed: m.sign * np.exp(-((m.v / speed) ** 2))),
-            low=0.0,
-            variable="velocity",
             shaped_by=_shape("v_s", "{x}/s", scale.speed / 2),
             seeds=_falling(scale.speed)[1:],
         ),
@@ -388,40 +383,27 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
 def oscillator_effects(scale: Scale) -> list[Effect]:
     """Library of effects for an oscillator."""
     at, drive = partial(_force, location="oscillator"), partial(_force, location="input", variable="input")
+    spring, damping = partial(at, variable="position"), partial(at, low=0.0, variable="velocity")
     far = "the response far above the resonance at several levels"
     level = _shape("level", "{F}", scale.force, 0.01)
     found = [
-        at(
-            "cubic_stiffness",
-            "cubic stiffness, a restoring force k3 y^3",
-            SWEEP,
-            ("k3", "{F}/{x}^3", lambda m: m.q**3),
-            variable="position",
+        spring(
+            "cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", SWEEP, ("k3", "{F}/{x}^3", lambda m: m.q**3)
         ),
-        at(
+        spring(
             "quadratic_stiffness",
             "quadratic stiffness, a restoring force k2 y^2",
             "the mean displacement under a sine at several levels",
             ("k2", "{F}/{x}^2", lambda m: m.q**2),
-            variable="position",
         ),
         *_stops(scale.reach, "oscillator", lambda m: m.q),
-        at(
+        damping(
             "quadratic_damping",
             "quadratic damping, a force d2 |y'| y'",
             DECAY,
             ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
-            low=0.0,
-            variable="velocity",
         ),
-        at(
-            "cubic_damping",
-            "cubic damping, a force d3 y'^3",
-            DECAY,
-            ("d3", "{F} s^3/{x}^3", lambda m: m.v**3),
-            low=0.0,
-            variable="velocity",
-        ),
+        damping("cubic_damping", "cubic damping, a force d3 y'^3", DECAY, ("d3", "{F} s^3/{x}^3", lambda m: m.v**3)),
         *_coulomb(scale, "friction damping, a force of constant size against the motion", DECAY, "oscillator"),
         at(
             "position_damping",

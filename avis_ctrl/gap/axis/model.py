@@ -22,6 +22,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.records import Lines, Shape
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.priors import Priors
+from avis_ctrl.identification.response import Driven
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -97,14 +98,6 @@ class Effect:
         return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Predicted Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
-
-    Y: np.ndarray
-    dY: np.ndarray
-
-
 def central_differences(
     function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float] | np.ndarray
 ) -> list[np.ndarray]:
@@ -125,25 +118,25 @@ def summed(parts: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class AxisModel:
-    """A base model with effects. base : names and units of the base parameters; the first one is positive.
+    """A base model with effects. base : its parameters, of which those that are not linear are positive.
 
     A subclass defines `predicted`, and `steps` for its derivatives.
     """
 
     lines: Any
-    base: tuple[tuple[str, str], ...]
+    base: tuple[Parameter, ...]
     effects: tuple[Effect, ...]
     values: np.ndarray
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters: those of the base model, then those of the effects."""
-        return (*(name for name, _ in self.base), *(name for one in self.effects for name in one.names))
+        return (*(p.name for p in self.base), *(name for one in self.effects for name in one.names))
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of all parameters."""
-        return (*(unit for _, unit in self.base), *(p.unit for one in self.effects for p in one.parameters))
+        return (*(p.unit for p in self.base), *(p.unit for one in self.effects for p in one.parameters))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -191,12 +184,12 @@ class AxisModel:
         """(p,) steps of the central differences."""
         raise NotImplementedError
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        """Predicted outputs on the lines of a block, and their derivatives."""
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
+        """Predicted outputs (n, n_y, 1) on the lines of a block, and their derivatives (p, n, n_y, 1)."""
         Y, dY = self.predicted(block), []
         if derivative:
             dY = central_differences(lambda x: replace(self, values=x).predicted(block), self.values, self.steps())
-        return Prediction(Y[:, :, None], np.reshape(dY, (len(dY), *Y.shape, 1)))
+        return Driven(Y[:, :, None], np.reshape(dY, (len(dY), *Y.shape, 1)))
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         """(n, n_y, 1) part of the prediction that may have a relative error, constant over a band: all of it.
@@ -223,7 +216,7 @@ class MassModel(AxisModel):
             ]
         )
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
         n, s, around, several = len(self.base), 1j * block.omega, self.lines.around(block.omega), self.parts
         A, V, Q, F = (
             self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q, self.lines.F)
@@ -244,7 +237,7 @@ class MassModel(AxisModel):
         D = -P[:, 1] if drive else Z
         Y = summed(F if drive else Q) + f / D
         if not derivative:
-            return Prediction(Y[:, None, None], np.empty((0, len(s), 1, 1)))
+            return Driven(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
             return -summed(column) / D - (0.0 if drive else f / D**2 * z)
@@ -265,22 +258,20 @@ class MassModel(AxisModel):
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
                 dY += [summed(slope * F) / D + (f / D**2 * slope[:, 1] if drive else 0.0) for slope in dP]
-        return Prediction(Y[:, None, None], np.array(dY)[:, :, None, None])
+        return Driven(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A base model at its initial values, with the effects that it may lack.
 
-    positive : which of the base parameters are positive. noise : noise power on the held-out lines over that of the
-    response; None if it cannot be estimated. notes : sentences on the data. units : of {F} and {x}, and names of input
-    and output. ratios : function from values by name to derived quantities with units. plain : base model data that a
-    simulation needs.
+    noise : noise power on the held-out lines over that of the response; None if it cannot be estimated. notes :
+    sentences on the data. units : of {F} and {x}, and names of input and output. ratios : function from values by name
+    to derived quantities with units. plain : base model data that a simulation needs.
     """
 
     kind: str
     model: AxisModel
-    positive: tuple[bool, ...]
     effects: Sequence[Effect]
     noise: float | None
     notes: tuple[str, ...]
@@ -299,14 +290,6 @@ class Problem:
         return [one for one in self.effects if one.outside]
 
 
-def base_priors(problem: Problem, settings: AxisSettings = SETTINGS) -> Priors:
-    """Priors of the base parameters, wide enough to have no influence: a factor of e, or as much as the whole
-    response."""
-    model, up = problem.model, np.array(problem.positive, bool)
-    sigma = np.where(up, settings.shape_spread, sizes(model, range(len(up))))
-    return Priors(model.names, np.where(up, model.values, 0.0), sigma, up)
-
-
 def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
     """Parameter values that change the prediction by as much as the whole response, r.m.s. over the fitted lines."""
     power, total = np.zeros(len(at)), 0
@@ -318,17 +301,18 @@ def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
     return 1 / np.sqrt(np.maximum(power / total, 1e-300))
 
 
-def effect_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
-    """Priors of the parameters of a model's last effect, at its initial values."""
-    one = model.effects[-1]
-    n = len(one.parameters)
-    start, linear = model.values[-n:], np.array([p.linear for p in one.parameters], bool)
-    size = sizes(model, range(len(model.values) - n, len(model.values)))
+def added_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
+    """Priors of the parameters of a model's last effect, or of the base of a model without effects, about their initial
+    values. They are so wide that they have no influence: a factor of e, or as much as the whole response."""
+    names, parameters = model.names, model.base
+    if model.effects:
+        names, parameters = model.effects[-1].names, model.effects[-1].parameters
+    n, linear = len(model.values), np.array([p.linear for p in parameters], bool)
     return Priors(
-        one.names,
-        np.where(linear, 0.0, start),
-        np.where(linear, size, settings.shape_spread),
+        names,
+        np.where(linear, 0.0, model.values[-len(names) :]),
+        np.where(linear, sizes(model, range(n - len(names), n)), settings.shape_spread),
         ~linear,
-        np.array([p.low for p in one.parameters]),
-        np.array([p.high for p in one.parameters]),
+        np.array([p.low for p in parameters]),
+        np.array([p.high for p in parameters]),
     )

@@ -253,19 +253,17 @@ class Lines:
             inside = level == one
             self.rows[name] = tuple(np.array(at)[inside].T)
             omega = np.tile(self.s.imag, int(inside.sum()))
-            Y = self.pick(self.Y, name)[:, None, None]
-            blocks.append(
-                SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y).with_noise(
-                    floor_of(omega, Y, self.settings)
-                )
-            )
+            Y = self.pick(self.Y, name)[:, None]
+            floor = self.settings.floor**2 * float(np.mean(np.abs(Y) ** 2))
+            blocks.append(block_of(name, omega, Y, np.full(Y.shape, floor)))
             levels.append(float(2.0**one * loud.max()))
         return Data(tuple(blocks), tuple(levels))
 
 
-def floor_of(omega: np.ndarray, Y: np.ndarray, settings: AxisSettings) -> np.ndarray:
-    """(n, 1, 1) minimum noise variance of every line."""
-    return np.full((len(omega), 1, 1), settings.floor**2 * float(np.mean(np.abs(Y) ** 2)))
+def block_of(name: str, omega: np.ndarray, Y: np.ndarray, variance: np.ndarray) -> SpectralBlock:
+    """Lines of outputs (n, n_y) with independent noise (n, n_y); the model itself keeps its inputs."""
+    block = SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y[:, :, None])
+    return block.with_noise(variance[:, :, None] * np.eye(Y.shape[1]))
 
 
 def _thinned(k: np.ndarray, f: np.ndarray, settings: AxisSettings) -> np.ndarray:

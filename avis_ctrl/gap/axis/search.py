@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from avis_ctrl.gap.axis.model import AxisModel, Effect, Problem, base_priors, effect_priors
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Problem, added_priors
 from avis_ctrl.gap.axis.settings import AxisSettings
 from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
@@ -69,7 +69,7 @@ class Explored:
 
     def __post_init__(self) -> None:
         model, data, settings = self.problem.model, self.data, self.settings
-        priors = base_priors(self.problem, settings)
+        priors = added_priors(model, settings)
         self.base = fit(model, priors, priors.z(model.values), data, first_variances(data, settings), settings)
         self.fits[frozenset()] = self.base
         self.cells = cache(partial(cells, settings=settings))
@@ -87,7 +87,7 @@ class Explored:
             model, priors, z = now.model, now.priors, now.z
             for one, values in added:
                 model = model.with_effect(one, values)
-                own = effect_priors(model, self.settings)
+                own = added_priors(model, self.settings)
                 priors, z = priors.followed_by(own), np.concatenate([z, own.z(values)])
             self.fits[labels] = self._fit(model, priors, z, now)
         return self.fits[labels]
@@ -143,6 +143,15 @@ class Explored:
         C = profile.free(np.concatenate(rows, axis=1)[linear | (not linear.any())])
         return Candidate(((one, seed),), C, C @ profile.e)
 
+    def in_place_of(self, now: Fitted, label: str, effects: Sequence[Effect], most: int) -> list[tuple[Effect, Fitted]]:
+        """Other effects in the place of one, and their fits; at most `most`, promising to first order."""
+        rest, own = self.without(now, label), now.model.effect(label).key
+        found = [] if rest is None else self.candidates(rest, effects)
+        known = max((c.reduction for c in found if c.first.key == own), default=0.0)
+        near = [c for c in found[:most] if c.reduction >= 0.5 * self.settings.not_far_behind * known]
+        fits = [(c.first, self.with_effects(rest, c.effects)) for c in near if rest is not None]
+        return [(effect, one) for effect, one in fits if one is not None and not at_an_edge(one)]
+
     def shortlist(self, now: Fitted) -> list[Candidate]:
         """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
         settings, found, one_law = self.settings, self.candidates(now, self.problem.library), dict[str, Candidate]()
@@ -195,18 +204,11 @@ def _revised(now: Fitted, explored: Explored, laws_only: bool) -> Fitted:
     """Replace each effect by another law of the same effect, or by any other effect, if the score rises."""
     settings, effects = explored.settings, explored.problem.library
     for label in now.labels:
-        own, rest = now.model.effect(label), explored.without(now, label)
-        if rest is None:
-            continue
-        laws = [one for one in effects if one.key == own.key]
-        found = explored.candidates(rest, laws if laws_only else effects)
-        least = 0.5 * settings.not_far_behind * max(c.reduction for c in found if c.first.key == own.key)
-        for c in found[: settings.starts + len(laws)]:
-            if c.reduction < least:
-                break
-            one = explored.with_effects(rest, c.effects)
-            if one is not None and not at_an_edge(one) and explored.score(one) > explored.score(now) + settings.settled:
-                now = one
+        laws = [one for one in effects if one.key == now.model.effect(label).key]
+        tried = explored.in_place_of(now, label, laws if laws_only else effects, settings.starts + len(laws))
+        best = max((one for _, one in tried), key=explored.score, default=now)
+        if explored.score(best) > explored.score(now) + settings.settled:
+            now = best
     return now
 
 
@@ -256,18 +258,12 @@ class Rival:
 
 def rivals(best: Fitted, label: str, explored: Explored) -> list[Rival]:
     """Effects that could replace a given one while all others are kept."""
-    settings, rest = explored.settings, explored.without(best, label)
-    if rest is None:
-        return []
-    found = explored.candidates(rest, explored.problem.library)
-    mine = next((c.reduction for c in found if c.first.label == label), 0.0)
-    known = []
-    for c in found[: 2 * settings.refits]:
-        if c.first.key == best.model.effect(label).key or c.reduction < 0.5 * settings.not_far_behind * mine:
-            continue
-        one = explored.with_effects(rest, c.effects)
-        if one is not None and not at_an_edge(one):
-            known.append(Rival(c.first, one, explored.odds_against(best, one), alike(best, one, settings)))
+    settings, own = explored.settings, best.model.effect(label).key
+    known = [
+        Rival(effect, one, explored.odds_against(best, one), alike(best, one, settings))
+        for effect, one in explored.in_place_of(best, label, explored.problem.library, 2 * settings.refits)
+        if effect.key != own
+    ]
     return sorted(known, key=lambda r: -r.odds)
 
 
