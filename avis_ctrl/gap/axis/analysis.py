@@ -16,6 +16,7 @@ from avis_ctrl.gap.axis.result import AxisGap, RunnerUp
 from avis_ctrl.gap.axis.search import Explored, Progress, Rival, at_an_edge, parts, rivals, robust, search, unnamed
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
+from avis_ctrl.gap.probability import Step, probability_of
 from avis_ctrl.gap.result import NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.validation import Half, Power, halves
 from avis_ctrl.identification.likelihood import Fitted
@@ -103,19 +104,16 @@ def _first_of_alike(best: Fitted, explored: Explored) -> Fitted:
 
 def _name(best: Fitted, one: Effect, explored: Explored) -> Name:
     settings, others, rest = explored.settings, rivals(best, one.label, explored), explored.without(best, one.label)
-    nothing = 0.0 if rest is None else explored.odds_against(best, rest)
-    by_key: dict[str, float] = {}
-    for other in others:
-        if not other.same:
-            by_key[other.effect.key] = max(by_key.get(other.effect.key, 0.0), other.odds)
-    probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
+    tried = {one.label: best, **{r.effect.label: r.fitted for r in others if not r.same}}
+    step = Step(rest or explored.base, best, tried, len(tried), one.label)
+    probability, _ = probability_of(step, settings, explored.odds_against)
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
     # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
     found = halves(best, one.sizes, settings, parts(best, one.sizes), dict.fromkeys(one.sizes, 0.0))
     refused = _refusal(best, rest, found, explored)
     if probability < settings.headline:
-        rival = max(others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing"
-        refused = f"{rival} in its place is as probable"
+        odds = {"nothing": explored.odds_against(best, step.before), **{r.effect.name: r.odds for r in others[::-1]}}
+        refused = f"{max(odds, key=lambda name: odds[name])} in its place is as probable"
     return Name(one, probability, near, refused, _widening(found, settings))
 
 
@@ -229,10 +227,6 @@ def _gap(
     stages = _stages(best, [*(one.label for one in effects), *outside], explored)
     closed = found.after <= max(settings.within_noise * found.floor, found.floor + settings.small**2)
     kinds: tuple[Verdict, Verdict] = ("partly explained", "explained") if reported else ("unexplained", "none")
-    base_values = {
-        p.name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])), p.unit.format(**problem.units))
-        for k, p in enumerate(best.model.base)
-    }
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
     unknown = next((one.title for fitted in (best, free) if fitted for one in fitted.model.effects if one.outside), "")
     sentences = _sentences(problem, kinds[closed], reported, traces, stages, names, unknown)
@@ -244,6 +238,14 @@ def _gap(
         for one in names
         for r in one.rivals
     )
+
+    def base_values(values: np.ndarray) -> dict[str, tuple[float, str]]:
+        return {p.name: (value, p.unit) for p, value in zip(best.model.base, values.tolist(), strict=False)}
+
+    def ratios(values: np.ndarray) -> Mapping[str, tuple[float, str]]:
+        names = (name.partition("@")[0] for name in best.model.names)
+        return problem.ratios(dict(zip(names, values.tolist(), strict=True)))
+
     over_noise = np.nan if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300)))
     return AxisGap(
         problem.kind,
@@ -255,8 +257,8 @@ def _gap(
         Remainder(stages[-1].nrmse, over_noise, found.remaining),
         tuple(sentences),
         onward,
-        base_values,
-        _ratios(problem, best, covariance),
+        _propagated(base_values, best.model.values, covariance, problem),
+        _propagated(ratios, best.model.values, covariance, problem),
         ups,
         _pictures(base, best, stages),
         {"kind": problem.kind, **problem.plain, "baseline": _plain(base), "updated": _plain(best)},
@@ -264,16 +266,9 @@ def _gap(
 
 
 def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
-    values, effect = best.model.of(one.effect), one.effect
+    effect = one.effect
     rows = [best.model.names.index(name) for name in effect.names]
-    own = covariance[np.ix_(rows, rows)]
-    if effect.derived:
-        found = _propagated(effect.derived, values, own, problem)
-    else:
-        found = {
-            p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
-            for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))
-        }
+    found = _propagated(effect.reported, best.model.of(effect), covariance[np.ix_(rows, rows)], problem)
     return NamedEffect(
         effect.name,
         effect.location,
@@ -317,13 +312,6 @@ def _stages(best: Fitted, labels: Sequence[str], explored: Explored) -> list[Sta
         one = rest
     over = np.nan if noise is None else 1 / max(noise, 1e-300)
     return [Stage(name, float(np.sqrt(power(one))), power(one) * over) for name, one in models]
-
-
-def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str, Reported]:
-    names = [name.partition("@")[0] for name in best.model.names]
-    return _propagated(
-        lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values, covariance, problem
-    )
 
 
 def _plain(fitted: Fitted) -> dict[str, Any]:

@@ -93,6 +93,12 @@ class Effect:
         """Names, as in a model, of the parameters in which it is linear."""
         return [name for name, p in zip(self.names, self.parameters, strict=True) if p.linear]
 
+    def reported(self, values: np.ndarray) -> Mapping[str, tuple[float, str]]:
+        """Quantities with units that are reported for these values of the parameters."""
+        if self.derived:
+            return self.derived(values)
+        return {p.name: (value, p.unit) for p, value in zip(self.parameters, values.tolist(), strict=True)}
+
     def initial_values(self) -> list[np.ndarray]:
         """Initial values of fits; zero by default."""
         return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
