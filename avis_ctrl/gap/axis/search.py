@@ -21,7 +21,6 @@ from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
 from avis_ctrl.gap.search import fit_or_none
 from avis_ctrl.gap.validation import by_information
-from avis_ctrl.identification.clusters import cluster_moves
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
 from avis_ctrl.identification.priors import Priors
@@ -312,9 +311,10 @@ def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
 
 
 def robust(fitted: Fitted) -> np.ndarray:
-    """Covariance of all parameter values, which allows any correlation within a segment (`clusters`). No variance is
-    below that of the fit."""
+    """Covariance of all parameter values, with the scores summed over each segment (K. Liang, S. Zeger, Biometrika 73
+    (1986) 13), which allows any correlation within a segment. No variance is below that of the fit."""
     segment, slope = row_table(fitted, fitted.model.lines.fitted)[1], fitted.priors.slopes(fitted.z)
-    P = fitted.covariance
-    moves = cluster_moves(P, fitted.J, fitted.e, [np.flatnonzero(segment == one) for one in np.unique(segment)])
-    return not_below(P @ P + moves.T @ moves, P) * np.outer(slope, slope)
+    inside = np.unique(segment)[:, None] == segment
+    scores = (inside * fitted.e) @ fitted.J.T - fitted.z / len(inside)
+    P, few = fitted.covariance, len(inside) / max(len(inside) - 1, 1)
+    return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)
