@@ -112,8 +112,8 @@ def _name(best: Fitted, one: Effect, explored: Explored) -> Name:
     found = halves(best, one.sizes, settings, parts(best, one.sizes), dict.fromkeys(one.sizes, 0.0))
     refused = _refusal(best, rest, found, explored)
     if probability < settings.headline:
-        odds = {"nothing": explored.odds_against(best, step.before), **{r.effect.name: r.odds for r in others[::-1]}}
-        refused = f"{max(odds, key=lambda name: odds[name])} in its place is as probable"
+        odds = [(explored.odds_against(best, step.before), "nothing"), *((r.odds, r.effect.name) for r in others)]
+        refused = f"{max(odds, key=lambda one: one[0])[1]} in its place is as probable"
     return Name(one, probability, near, refused, _widening(found, settings))
 
 
