@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from math import isnan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,35 +55,29 @@ def gap_axis(
     from avis_ctrl.study.files import output_folder
     from avis_ctrl.study.gap_axis import FILES, write_axis_gap
 
-    names, scales = roles(columns) or None, factors(scale) or None
-    options: dict[str, Any] = {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}
-    options = {name: value for name, value in options.items() if value is not None}
-    reading: dict[str, Any] = {"output": output, "range_s": range_s, "resample_Hz": resample_Hz}
+    given: dict[str, Any] = {
+        "kind": kind,
+        "columns": roles(columns) or None,
+        "scale": factors(scale) or None,
+        "sample_rate_Hz": sample_rate_Hz,
+        "output": output,
+        "range_s": range_s,
+        "resample_Hz": resample_Hz,
+        **{name: one for name, one in {"band_Hz": band_Hz, "cutoff_Hz": cutoff_Hz}.items() if one is not None},
+    }
     terminal = Terminal()
     files: list[str] = []
     with output_folder(out, FILES) if out else nullcontext() as folder:
         with Progress(terminal) as progress:
-            found = find_axis_gap_in(
-                kind,
-                [path, *(also or ())] if also else path,
-                names,
-                scale=scales,
-                sample_rate_Hz=sample_rate_Hz,
-                progress=progress,
-                **reading,
-                **options,
-            )
+            found = find_axis_gap_in(path=[path, *(also or ())], progress=progress, **given)
         if folder:
-            given = {"kind": kind, "columns": names, "scale": scales, "sample_rate_Hz": sample_rate_Hz}
-            files = write_axis_gap(
-                folder, found, path.name, {**given, **reading, **options}, lambda *told: rendered(document(*told))
-            )
+            files = write_axis_gap(folder, found, path.name, given, lambda *told: rendered(document(*told)))
     terminal.print(f"verdict: {found.verdict}")
     terminal.print(*found.sentences, soft_wrap=True, markup=False)
     values = (*found.parameters.items(), *found.ratios.items())
     terminal.print(*(f"{name} = {one}" for name, one in values), markup=False)
     for stage in found.stages:
-        noise = "" if stage.chi2_per_dof is None else f", chi2/dof {stage.chi2_per_dof:.4g}"
+        noise = "" if isnan(stage.chi2_per_dof) else f", chi2/dof {stage.chi2_per_dof:.4g}"
         error = f"- {stage.name}: {100 * stage.nrmse:.3g} % on held-out data{noise}"
         terminal.print(error, soft_wrap=True, markup=False)
     if folder:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,15 +67,18 @@ def odds_against_fit(one: Fitted, other: Fitted) -> float:
     return larger_odds(mine, theirs, beside)
 
 
-def probability_of(step: Step, settings: GapSettings) -> tuple[float, tuple[str, ...]]:
+def probability_of(
+    step: Step, settings: GapSettings, odds_against: Callable[[Fitted, Fitted], float] = odds_against_fit
+) -> tuple[float, tuple[str, ...]]:
     """Probability of the accepted effect among all effects fitted in its place, and the names that cannot be ruled out.
-    Effects without a name in the library have a lower prior probability."""
+    Effects without a name in the library have a lower prior probability. odds_against : odds of the second fit against
+    the first."""
     own, mine = name_of(step.label), step.tried[step.label]
-    odds = {("", ""): odds_against_fit(mine, step.before)}
+    odds = {("", ""): odds_against(mine, step.before)}
     for label, one in step.tried.items():
         if name_of(label) != own:
-            outside = settings.outside_odds if one.model.effects[-1].effect.outside else 1.0
-            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against_fit(mine, one) / outside)
+            outside = settings.outside_odds if one.model.effects[-1].outside else 1.0
+            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against(mine, one) / outside)
     probability = 1 / (1 + sum(odds.values()))
     rivals = [
         name

@@ -234,8 +234,33 @@ class RecordGap:
     kind: str = ""
 
 
+class Findings:
+    """What the results of a table and of one axis have in common."""
+
+    verdict: Verdict
+    effects: tuple[NamedEffect, ...]
+    traces: tuple[NamedEffect, ...]
+    stages: tuple[Stage, ...]
+    remaining: tuple[Where, ...]
+    left: Remainder | None
+    next_experiment: str | None
+
+    def findings(self) -> dict[str, Any]:
+        """The keys of gap.json that do not depend on the kind of result."""
+        where = [one.to_json() for one in self.remaining]
+        return {
+            "verdict": self.verdict,
+            "effects": [one.to_json() for one in self.effects],
+            "traces": [one.to_json() for one in self.traces],
+            "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
+            "where": where,
+            "remaining": self.left and {**asdict(self.left), "where": where},
+            "next_experiment": self.next_experiment,
+        }
+
+
 @dataclass(frozen=True, eq=False)
-class Gap:
+class Gap(Findings):
     """The complete result.
 
     Attributes
@@ -281,17 +306,11 @@ class Gap:
 
     def to_json(self) -> dict[str, Any]:
         """gap.json of the contract, format "avis-gap" version 1."""
-        places = [one.to_json() for one in self.remaining]
         return {
             "format": "avis-gap",
             "version": 1,
-            "verdict": self.verdict,
-            "effects": [one.to_json() for one in self.effects],
-            "traces": [one.to_json() for one in self.traces],
-            "gap": [{"stage": one.name, "nrmse": one.nrmse, "chi2_per_dof": one.chi2_per_dof} for one in self.stages],
-            "where": places if self.verdict != "none" else [],
-            "remaining": None if self.left is None else {**asdict(self.left), "where": places},
+            **self.findings(),
+            **({"where": []} if self.verdict == "none" else {}),
             "tolerances": [one.to_json() for one in self.tolerances],
-            "next_experiment": self.next_experiment,
             "seconds": self.seconds,
         }

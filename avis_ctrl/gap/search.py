@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -121,7 +122,7 @@ def with_effect(fitted: Fitted, one: ActiveEffect, data: Data, settings: GapSett
     model = fitted.model.with_effect(one)
     own = _priors_of(one, model, settings)
     z = np.concatenate([_without_tolerances_behind(fitted, one), own.z(np.array(one.values))])
-    return _try(fitted, model, rescaled(fitted.priors, one, settings.held).followed_by(own), z, data, settings)
+    return fit_or_none(fitted, model, rescaled(fitted.priors, one, settings.held).followed_by(own), z, data, settings)
 
 
 def _without_tolerances_behind(fitted: Fitted, one: ActiveEffect) -> np.ndarray:
@@ -138,12 +139,13 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     one = fitted.model.effect(label)
     rows = [fitted.priors.names.index(name) for name in model.names]
     priors = rescaled(fitted.priors, one, 1 / settings.held).of(model.names)
-    return _try(fitted, model, priors, fitted.z[rows], data, settings)
+    return fit_or_none(fitted, model, priors, fitted.z[rows], data, settings)
 
 
-def _try(
-    fitted: Fitted, model: TableModel, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
+def fit_or_none(
+    fitted: Fitted, model: Any, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
 ) -> Fitted | None:
+    """The fit of a model from z, with the variances of another fit to start with; None if it fails."""
     try:
         return fit(model, priors, z, data, fitted.variances, settings)
     except (AvisError, np.linalg.LinAlgError, FloatingPointError):

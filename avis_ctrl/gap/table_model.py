@@ -58,6 +58,11 @@ class ActiveEffect:
         return tuple(f"{self.label}.{one.name}" for one in self.parameters)
 
     @property
+    def outside(self) -> bool:
+        """Whether the library has no name for it."""
+        return self.effect.outside
+
+    @property
     def by_name(self) -> dict[str, float]:
         """Values by name of the parameter."""
         return dict(zip((one.name for one in self.parameters), self.values, strict=True))

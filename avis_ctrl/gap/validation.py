@@ -13,7 +13,6 @@ from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.weights import Group
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +84,7 @@ def halves(
     effect = _departure(fitted, absent)
     away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
     found = []
-    if parts is None:
-        parts = [
-            (words, np.concatenate([fitted.rows[group] for group in groups])) for words, groups in _parts(fitted, rows)
-        ]
-    for words, at in parts:
+    for words, at in _parts(fitted, rows) if parts is None else parts:
         J, e = fitted.J[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
         step = np.linalg.solve(root, (P @ (J @ e - fitted.z))[rows])
@@ -119,24 +114,22 @@ def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:
     return np.asarray(found) if rows and np.all(np.isfinite(found)) else np.empty(0)
 
 
-def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, list[Group]]]:
-    """Halves of the groups, by band and by level, each with about half of the information on the parameters."""
-    information: dict[Group, float] = {
-        group: float(np.sum(fitted.J[rows][:, at] ** 2)) for group, at in fitted.rows.items()
-    }
-    found = []
-    for k, words in (
-        (1, ("the lower part of the band", "the upper part of the band")),
-        (0, ("low levels", "high levels")),
-    ):
-        by: dict[float, float] = {}
-        for group, value in information.items():
-            by[group[k]] = by.get(group[k], 0.0) + value
-        order = sorted(by)
-        total = np.cumsum([by[key] for key in order])
-        below = {key for key, value in zip(order, total, strict=True) if value <= total[-1] / 2}
-        for word, inside in zip(words, (True, False), strict=True):
-            own = [group for group in fitted.rows if (group[k] in below) == inside]
-            if below and own:
-                found.append((word, own))
-    return found
+def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, np.ndarray]]:
+    """Halves of the residual, by band and by level, each with about half of the information on the parameters."""
+    information = np.sum(fitted.J[rows] ** 2, axis=0)
+    band, level = np.empty(len(information)), np.empty(len(information))
+    for group, at in fitted.rows.items():
+        level[at], band[at] = group
+    return [
+        *by_information(band, information, "the lower part of the band", "the upper part of the band"),
+        *by_information(level, information, "low levels", "high levels"),
+    ]
+
+
+def by_information(values: np.ndarray, information: np.ndarray, *words: str) -> list[tuple[str, np.ndarray]]:
+    """Rows (N,) with low and with high values, each with about half of the information, which is given by row, and
+    their names; empty if they cannot be divided."""
+    _, place = np.unique(values, return_inverse=True)
+    total = np.cumsum(np.bincount(place, information))
+    low = (total <= total[-1] / 2)[place]
+    return [(words[0], np.flatnonzero(low)), (words[1], np.flatnonzero(~low))] if low.any() else []

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import avis_ctrl
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
 from avis_ctrl.gap.axis.find import Reading, signals_in
@@ -20,8 +17,11 @@ from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.axis.settings import SETTINGS
 from avis_ctrl.gap.axis.simulation import predicted
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
+from avis_ctrl.rigs.file_errors import read_json
+from avis_ctrl.study.files import as_json
+from avis_ctrl.study.provenance import provenance
 
-MODEL_FILE = "axis_model.json"
+MODEL_FILE, MODEL_FORMAT = "axis_model.json", "avis-axis-model"
 FILES = "gap.json", "gap.html", "gap.pdf", MODEL_FILE
 
 
@@ -36,27 +36,20 @@ def write_axis_gap(
 
     reports : makes the two reports from gap, source and provenance.
     """
-    made = {
-        "avis_ctrl": avis_ctrl.__version__,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "measurement": source,
-        "inputs_sha256": hashlib.sha256(json.dumps(options, sort_keys=True, default=str).encode()).hexdigest(),
-        "options": options,
-        "settings": asdict(SETTINGS),
-    }
+    inputs = json.dumps(options, sort_keys=True, default=str)
+    libraries = ("numpy", "scipy", "numba")
+    made = provenance(
+        None, inputs, None, gap.seconds, libraries, measurement=source, options=options, settings=asdict(SETTINGS)
+    )
     files = {
-        "gap.json": _json({**gap.to_json(), "provenance": made}),
+        "gap.json": as_json({**gap.to_json(), "provenance": made}),
         **dict(zip(FILES[1:3], reports(gap, source, made), strict=True)),
     }
     if "reading" in gap.model:
-        files[MODEL_FILE] = _json({"format": "avis-axis-model", "version": 1, **gap.model})
+        files[MODEL_FILE] = as_json({"format": MODEL_FORMAT, "version": 1, **gap.model})
     # A model of an earlier run of another kind is removed: `avis predict` would use it.
     write_together(folder, files, [folder / name for name in FILES])
     return list(files)
-
-
-def _json(plain: Any) -> bytes:
-    return json.dumps(plain, indent=2, allow_nan=False, default=str).encode()
 
 
 def is_axis_gap(folder: Path) -> bool:
@@ -77,20 +70,13 @@ def write_axis_predictions(folder: Path, paths: Sequence[Path], out: Path) -> li
     ------
     InputError : a folder without a model, records that do not fit. ComputationError : a motion that diverges.
     """
+    path = folder / MODEL_FILE
+    expected = "the model of a drive or an oscillator: other kinds are responses, which predict no record"
+    model = read_json(path, MODEL_FORMAT, expected)
     try:
-        model = json.loads((folder / MODEL_FILE).read_text(encoding="utf-8"))
-        if model.get("format") != "avis-axis-model":
-            raise ValueError("another format")
         reading = Reading(**{**model["reading"], "range_s": None})
-    except FileNotFoundError:
-        raise InputError(
-            "expected the model of a drive or an oscillator: other kinds are responses, which predict no record",
-            file=folder / MODEL_FILE,
-        ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(
-            f"expected a model as avis gap-axis writes it: {error}".splitlines()[0], file=folder / MODEL_FILE
-        ) from None
+    except (KeyError, TypeError) as error:
+        raise InputError(f"expected a model as avis gap-axis writes it: {error}", file=path) from None
     kind = model["kind"]
     records, rate = signals_in(kind, paths, reading)
     if abs(rate / model["rate_Hz"] - 1) > 1e-3:

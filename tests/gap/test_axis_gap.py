@@ -116,7 +116,7 @@ def test_two_effects_are_named_both():
 @pytest.mark.parametrize(("seed", "noise"), [(1, 1e-3), *slow((2, 1e-3), (3, 1e-3)), (4, 0.1)])
 def test_nothing_is_named_where_nothing_is_missing(seed, noise):
     gap = searched(lambda y, v: 0.0, seed, n=16_384, noise=noise)
-    assert gap.verdict == "none" and not gap.effects and gap.where
+    assert gap.verdict == "none" and not gap.effects and gap.remaining
     assert gap.sentences[0].startswith("No missing effect was found")
 
 
@@ -140,7 +140,7 @@ def test_false_alarms_are_few():
 def test_outside_the_library_nothing_is_named(extra):
     gap = searched(extra, 3)
     assert gap.verdict == "unexplained" and not gap.effects
-    assert gap.where and "no effect of the library explains it" in gap.sentences[0]
+    assert gap.remaining and "no effect of the library explains it" in gap.sentences[0]
     assert any("another function of the position" in s for s in gap.sentences)
 
 
@@ -473,9 +473,9 @@ def test_effects_that_are_lost_with_a_failed_fit_are_reported(monkeypatch):
     u, y = oscillator(lambda y, v: 0.01 * y**3, 1, n=4096)
     (first, second) = ("cubic_stiffness", "quadratic_damping")
 
-    def both(base, explored, effects, progress):
-        chosen = [next(one for one in effects if one.name == name) for name in (first, second)]
-        return explored.with_effects(base, [(one, np.zeros(len(one.parameters))) for one in chosen])
+    def both(explored, progress):
+        chosen = [next(one for one in explored.problem.library if one.name == name) for name in (first, second)]
+        return explored.with_effects(explored.base, [(one, np.zeros(len(one.parameters))) for one in chosen])
 
     monkeypatch.setattr(analysis, "search", both)
     monkeypatch.setattr(analysis, "_refusal", lambda *known: "it is refused")

@@ -323,7 +323,7 @@ def test_a_response_removes_the_model_of_an_earlier_drive(tmp_path):
     """A seismometer has no model that predicts records; that of another kind in the same folder would be used."""
 
     def written(model):
-        found = SimpleNamespace(model=model, to_json=lambda: {"format": "avis-gap-axis"})
+        found = SimpleNamespace(model=model, seconds=1.0, to_json=lambda: {"format": "avis-gap-axis"})
         return write_axis_gap(tmp_path, found, "record.csv", {}, lambda *given: (b"<html></html>", b"%PDF-1.7"))
 
     assert written({"kind": "drive", "reading": {}})[-1] == "axis_model.json"

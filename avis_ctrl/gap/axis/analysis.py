@@ -6,43 +6,22 @@ Problem -> base fit -> search -> names (rivals, halves, held-out data) -> stages
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from avis_ctrl.gap.axis.model import AxisModel, Effect, base_priors
-from avis_ctrl.gap.axis.result import AxisGap, AxisStage, RunnerUp
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Problem
+from avis_ctrl.gap.axis.result import AxisGap, RunnerUp
 from avis_ctrl.gap.axis.search import Explored, Progress, Rival, at_an_edge, parts, rivals, robust, search, unnamed
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.result import NamedEffect, missed
-from avis_ctrl.gap.validation import Half, halves
+from avis_ctrl.gap.probability import Step, probability_of
+from avis_ctrl.gap.result import NamedEffect, Remainder, Stage, Verdict, Where, missed
+from avis_ctrl.gap.validation import Half, Power, halves
 from avis_ctrl.identification.likelihood import Fitted
+from avis_ctrl.identification.single_axis.fit import slopes
 from avis_ctrl.measurement.gates.finding import Picture, Series
-
-Ratios = Callable[[Mapping[str, float]], Mapping[str, tuple[float, str]]]
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """A base model at its initial values, with the effects that it may lack.
-
-    positive : which of the base parameters are positive. noise : noise power on the held-out lines over that of the
-    response; None if it cannot be estimated. units : of {F} and {x}, and names of input and output. ratios : function
-    from values by name to derived quantities with units. notes : sentences on the data. plain : base model data that a
-    simulation needs.
-    """
-
-    kind: str
-    model: AxisModel
-    positive: tuple[bool, ...]
-    effects: Sequence[Effect]
-    noise: float | None = None
-    units: Mapping[str, str] = field(default_factory=dict)
-    ratios: Ratios = lambda values: {}
-    notes: tuple[str, ...] = ()
-    plain: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,109 +42,79 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     ------
     InputError, ComputationError : as in the fit of the base model.
     """
-    explored = Explored(problem.model.lines.fitted, settings)
     progress("base model")
-    base = explored.base(problem.model, base_priors(problem.model, problem.positive, settings))
-    best = _first_of_alike(search(base, explored, problem.effects, progress), explored, problem)
+    explored = Explored(problem, settings)
+    base = explored.base
+    best = _first_of_alike(search(explored, progress), explored)
     progress("names")
-    refused: list[Name] = []
+    refused: dict[str, str] = {}
     while True:
-        names = [_name(best, one, explored, problem, settings) for one in best.model.effects if not one.outside]
+        names = [_name(best, one, explored) for one in best.model.effects if not one.outside]
         worst = min((one for one in names if one.refused), key=lambda one: one.probability, default=None)
-        better = None if worst else _better_shape(best, explored, problem, settings)
-        if better is not None:
+        if worst is not None:
+            wrong = {worst.effect: worst.refused}
+        elif better := _better_shape(best, explored):
             best, variable = better
-            wrong = [one for one in names if one.effect.variable == variable]
-            refused += [
-                replace(one, refused=f"another function of the {variable} gives a much smaller residual")
-                for one in wrong
-            ]
+            why = f"another function of the {variable} gives a much smaller residual"
+            wrong = {one.effect: why for one in names if one.effect.variable == variable}
         else:
-            wrong = [worst] if worst else []
-            refused += wrong
-        if not wrong:
-            free = unnamed(best, explored, problem.effects)
-            shares = Contributions.of(base, best, free, names, explored, problem)
-            uncertain = [one for one in names if not shares.certain(best, one.effect, settings)]
-            wrong = sorted(uncertain, key=lambda one: shares.of_effect[one.effect.label])[:1]
-            refused += [replace(one, refused="its size is not certain to differ from zero") for one in wrong]
-        for one in wrong:
-            rest = explored.without(best, one.effect.label)
-            if rest is None:  # nothing is known of the other effects without this one
-                refused += [
-                    replace(other, refused=f"no fit without {one.effect.name} succeeded")
-                    for other in names
-                    if other not in wrong
-                ]
-            best = rest or base
+            free = unnamed(best, explored)
+            shares = Contributions.of(best, free, names, explored)
+            uncertain = [one.effect for one in names if not shares.certain(best, one.effect, settings)]
+            uncertain.sort(key=lambda one: shares.of_effect[one.label])
+            wrong = dict.fromkeys(uncertain[:1], "its size is not certain to differ from zero")
         if not wrong:
             break
+        refused |= {one.name: why for one, why in wrong.items()}
+        for one in wrong:
+            rest = explored.without(best, one.label)
+            if rest is None:  # nothing is known of the other effects without this one
+                why = f"no fit without {one.name} succeeded"
+                refused |= {other.effect.name: why for other in names if other.effect not in wrong}
+            best = rest or base
     removed = power(base) - power(best)
     if not names or (free is not None and removed < settings.right_shape * (power(base) - power(free))):
-        refused += [replace(one, refused="a function of another shape takes far more") for one in names]
-        names, best, free = [], base, unnamed(base, explored, problem.effects)
-        shares = Contributions.of(base, best, free, names, explored, problem)
-    return _gap(problem, base, best, free, shares, names, refused, explored, settings)
+        refused |= {one.effect.name: "a function of another shape takes far more" for one in names}
+        names, best, free = [], base, unnamed(base, explored)
+        shares = Contributions.of(best, free, names, explored)
+    return _gap(explored, best, free, shares, names, refused)
 
 
-def _better_shape(
-    best: Fitted, explored: Explored, problem: Problem, settings: AxisSettings
-) -> tuple[Fitted, str] | None:
+def _better_shape(best: Fitted, explored: Explored) -> tuple[Fitted, str] | None:
     """The model with a free function of the variable of a named effect, and that variable, if its residual is much
     smaller; else None. A law that is only close to the true one must not be named."""
     known = {one.variable for one in best.model.effects if one.outside}
     for variable in sorted({one.variable for one in best.model.effects if one.variable} - known):
-        free = unnamed(best, explored, [one for one in problem.effects if one.outside and one.variable == variable])
-        if free is not None and power(free) < (1 - settings.right_shape) * power(best):
+        free = unnamed(best, explored, variable)
+        if free is not None and power(free) < (1 - explored.settings.right_shape) * power(best):
             return free, variable
     return None
 
 
-def _first_of_alike(best: Fitted, explored: Explored, problem: Problem) -> Fitted:
+def _first_of_alike(best: Fitted, explored: Explored) -> Fitted:
     """Replace each effect by the first one in the library that predicts the same."""
-    place = {one.key: k for k, one in reversed(list(enumerate(problem.effects)))}
+    keys = [one.key for one in explored.problem.effects]
     for label in best.labels:
-        own = next(one for one in best.model.effects if one.label == label)
-        same = [
-            r for r in rivals(best, label, explored, problem.effects) if r.same and place[r.effect.key] < place[own.key]
-        ]
-        if same:
-            best = min(same, key=lambda r: place[r.effect.key]).fitted
+        same = [r for r in rivals(best, label, explored) if r.same]
+        first = min(same, key=lambda r: keys.index(r.effect.key), default=None)
+        if first is not None and keys.index(first.effect.key) < keys.index(best.model.effect(label).key):
+            best = first.fitted
     return best
 
 
-def _name(best: Fitted, one: Effect, explored: Explored, problem: Problem, settings: AxisSettings) -> Name:
-    others = rivals(best, one.label, explored, problem.effects)
-    rest = explored.without(best, one.label)
-    nothing = 0.0 if rest is None else explored.odds_against(best, rest)
-    by_key: dict[str, float] = {}
-    for other in others:
-        if not other.same:
-            by_key[other.effect.key] = max(by_key.get(other.effect.key, 0.0), other.odds)
-    probability = min(1 / (1 + nothing + sum(by_key.values())), settings.most_sure)
+def _name(best: Fitted, one: Effect, explored: Explored) -> Name:
+    settings, others, rest = explored.settings, rivals(best, one.label, explored), explored.without(best, one.label)
+    tried = {one.label: best, **{r.effect.label: r.fitted for r in others if not r.same}}
+    step = Step(rest or explored.base, best, tried, len(tried), one.label)
+    probability, _ = probability_of(step, settings, explored.odds_against)
     near = tuple(r for r in others if r.same or r.odds * probability > settings.rival)
     # Only linear parameters are compared: a shape parameter is often determined by a part of the data alone.
-    parameters = _sizes(one)
-    found = halves(best, parameters, settings, parts(best, parameters), dict.fromkeys(parameters, 0.0))
-    return Name(
-        one,
-        probability,
-        near,
-        _refusal(
-            best,
-            rest,
-            probability,
-            found,
-            explored,
-            max(others, key=lambda r: r.odds).effect.name if sum(by_key.values()) > nothing else "nothing",
-        ),
-        _widening(found, settings),
-    )
-
-
-def _sizes(one: Effect) -> list[str]:
-    """Names, as in the model, of the parameters in which an effect is linear."""
-    return [f"{p.name}@{one.label}" for p in one.parameters if p.linear]
+    found = halves(best, one.sizes, settings, parts(best, one.sizes), dict.fromkeys(one.sizes, 0.0))
+    refused = _refusal(best, rest, found, explored)
+    if probability < settings.headline:
+        odds = [(explored.odds_against(best, step.before), "nothing"), *((r.odds, r.effect.name) for r in others)]
+        refused = f"{max(odds, key=lambda one: one[0])[1]} in its place is as probable"
+    return Name(one, probability, near, refused, _widening(found, settings))
 
 
 def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
@@ -174,18 +123,13 @@ def _widening(found: Sequence[Half], settings: AxisSettings) -> float:
     return max([1.0, *(float(np.sqrt(one.chi2 / one.dof)) for one in found if one.p_value < settings.widened_p_value)])
 
 
-def _refusal(
-    best: Fitted, rest: Fitted | None, probability: float, found: Sequence[Half], explored: Explored, rival: str
-) -> str:
-    settings = explored.settings
-    if probability < settings.headline:
-        return f"{rival} in its place is as probable"
+def _refusal(best: Fitted, rest: Fitted | None, found: Sequence[Half], explored: Explored) -> str:
     if edge := at_an_edge(best):
         return edge
     if rest is not None and explored.held_out(best) <= explored.held_out(rest):
         return "held-out data do not bear it out"
     for half in found:
-        if half.change > settings.law_change:
+        if half.change > explored.settings.law_change:
             return f"{half.words} calls for another size, by {100 * half.change:.0f} %"
     return ""
 
@@ -232,29 +176,25 @@ class Contributions:
     covariance: np.ndarray
 
     @staticmethod
-    def of(
-        base: Fitted, best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored, problem: Problem
-    ) -> Contributions:
+    def of(best: Fitted, free: Fitted | None, names: Sequence[Name], explored: Explored) -> Contributions:
         """Contributions of the named effects of `best`; free : the fit with a free function, None if there is none."""
-        whole = power(best)
-        before, after = power(base), whole
-        for one in best.model.effects:
-            if one.outside:
-                rest = explored.without(best, one.label)
-                after = max(after, power(rest) if rest else before)
-        floor = problem.noise if problem.noise is not None else min(whole, power(free) if free is not None else whole)
-        excess = max(before - floor, 1e-300)
-        remaining = max(after - floor, 0.0) / excess
-        shares, alone = {}, {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
-        for label, left_out in alone.items():
+
+        def without(label: str, otherwise: float) -> float:
             rest = explored.without(best, label)
-            taken = min(left_out, power(rest) if rest else left_out) - whole
-            shares[label] = float(np.clip(taken / excess, 0.0, 1.0))
+            return power(rest) if rest else otherwise
+
+        whole, before, noise = power(best), power(explored.base), explored.problem.noise
+        after = max(whole, *(without(one.label, before) for one in best.model.effects if one.outside), 0.0)
+        floor = noise if noise is not None else min(whole, power(free) if free is not None else whole)
+        gap = Power(floor, before)
+        remaining = max(after - floor, 0.0) / gap.excess
+        alone = {one.effect.label: power(best.model.without(one.effect.label)) for one in names}
+        shares = {label: gap.share(min(left, without(label, left)) - whole) for label, left in alone.items()}
         return Contributions(floor, after, remaining, alone, shares, _widened(best, names, shares, remaining))
 
     def certain(self, best: Fitted, one: Effect, settings: AxisSettings) -> bool:
         """Whether an effect's size differs from zero by at least `apart` standard deviations."""
-        at, std = [best.model.names.index(name) for name in _sizes(one)], np.sqrt(np.diag(self.covariance))
+        at, std = [best.model.names.index(name) for name in one.sizes], np.sqrt(np.diag(self.covariance))
         return any(abs(best.model.values[k]) >= settings.apart * std[k] for k in at)
 
 
@@ -264,80 +204,71 @@ def _widened(best: Fitted, names: Sequence[Name], shares: Mapping[str, float], r
     -1 to 1 with the effect (variance 1/3)."""
     factor, beside = np.ones(len(best.model.names)), np.zeros(len(best.model.names))
     for one in names:
-        for p, value in zip(one.effect.parameters, best.model.of(one.effect), strict=True):
-            k = best.model.names.index(f"{p.name}@{one.effect.label}")
-            factor[k] = one.widened
-            beside[k] = value**2 * remaining / (3 * max(shares[one.effect.label], remaining, 1e-12))
+        at = [best.model.names.index(name) for name in one.effect.names]
+        factor[at] = one.widened
+        beside[at] = best.model.of(one.effect) ** 2 * remaining / (3 * max(shares[one.effect.label], remaining, 1e-12))
     return robust(best) * np.outer(factor, factor) + np.diag(beside)
 
 
 def _gap(
-    problem: Problem,
-    base: Fitted,
+    explored: Explored,
     best: Fitted,
     free: Fitted | None,
     found: Contributions,
     names: Sequence[Name],
-    refused: Sequence[Name],
-    explored: Explored,
-    settings: AxisSettings,
+    refused: Mapping[str, str],
 ) -> AxisGap:
-    covariance, remaining = found.covariance, found.remaining
+    problem, settings, base, covariance = explored.problem, explored.settings, explored.base, found.covariance
     effects = [_reported(one, best, covariance, found.of_effect[one.effect.label], problem) for one in names]
     effects.sort(key=lambda one: -found.alone[one.label])
     reported = tuple(one for one in effects if (one.share or 0.0) >= settings.trace)
     traces = tuple(one for one in effects if (one.share or 0.0) < settings.trace)
     outside = [one.label for one in best.model.effects if one.outside]
-    stages = _stages(base, best, [*(one.label for one in effects), *outside], explored, problem)
-    closed = found.after <= settings.within_noise * found.floor or (
-        max(found.after - found.floor, 0.0) < settings.small**2
-    )
-    verdict = ("partly explained", "explained")[closed] if reported else ("unexplained", "none")[closed]
-    base_values = {
-        name: Reported(float(best.model.values[k]), float(np.sqrt(covariance[k, k])), unit.format(**problem.units))
-        for k, (name, unit) in enumerate(best.model.base)
-    }
-    where = _where(best, problem)
+    stages = _stages(best, [*(one.label for one in effects), *outside], explored)
+    closed = found.after <= max(settings.within_noise * found.floor, found.floor + settings.small**2)
+    kinds: tuple[Verdict, Verdict] = ("partly explained", "explained") if reported else ("unexplained", "none")
     onward = next((one.effect.separated_by for one in names if one.rivals), None)
-    unknown = next(
-        (one.title for fitted in (best, free) if fitted is not None for one in fitted.model.effects if one.outside), ""
-    )
-    sentences = _sentences(problem, verdict, reported, traces, stages, names, refused, unknown)
+    unknown = next((one.title for fitted in (best, free) if fitted for one in fitted.model.effects if one.outside), "")
+    sentences = _sentences(problem, kinds[closed], reported, traces, stages, names, unknown)
+    if refused:
+        lost = "; ".join(f"{name} reduces the gap, but {why}" for name, why in refused.items())
+        sentences.append(f"Not named: {lost}.")
     ups = tuple(
         RunnerUp(r.effect.key, one.effect.key, min(r.odds * one.probability, settings.most_sure))
         for one in names
         for r in one.rivals
     )
+
+    def base_values(values: np.ndarray) -> dict[str, tuple[float, str]]:
+        return {p.name: (value, p.unit) for p, value in zip(best.model.base, values.tolist(), strict=False)}
+
+    def ratios(values: np.ndarray) -> Mapping[str, tuple[float, str]]:
+        names = (name.partition("@")[0] for name in best.model.names)
+        return problem.ratios(dict(zip(names, values.tolist(), strict=True)))
+
+    over_noise = np.nan if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300)))
     return AxisGap(
         problem.kind,
-        verdict,
+        kinds[closed],
         reported,
         traces,
         tuple(stages),
-        where,
+        _where(best, problem),
+        Remainder(stages[-1].nrmse, over_noise, found.remaining),
         tuple(sentences),
         onward,
-        base_values,
-        _ratios(problem, best, covariance),
+        _propagated(base_values, best.model.values, covariance, problem),
+        _propagated(ratios, best.model.values, covariance, problem),
         ups,
-        None if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300))),
-        remaining,
         _pictures(base, best, stages),
         {"kind": problem.kind, **problem.plain, "baseline": _plain(base), "updated": _plain(best)},
     )
 
 
 def _reported(one: Name, best: Fitted, covariance: np.ndarray, share: float, problem: Problem) -> NamedEffect:
-    values, effect = best.model.of(one.effect), one.effect
-    rows = [best.model.names.index(f"{p.name}@{effect.label}") for p in effect.parameters]
-    own = covariance[np.ix_(rows, rows)]
-    if effect.derived:
-        found = _propagated(effect.derived, values, own, problem)
-    else:
-        found = {
-            p.name: Reported(float(value), float(np.sqrt(own[k, k])), p.unit.format(**problem.units))
-            for k, (p, value) in enumerate(zip(effect.parameters, values, strict=True))
-        }
+    effect = one.effect
+    rows = [best.model.names.index(name) for name in effect.names]
+    found = _propagated(effect.reported, best.model.of(effect), covariance[np.ix_(rows, rows)], problem)
     return NamedEffect(
         effect.name,
         effect.location,
@@ -357,76 +288,56 @@ def _propagated(
     problem: Problem,
 ) -> dict[str, Reported]:
     """Function values with standard deviations to first order."""
-    found = {}
-    for name, (value, unit) in function(values).items():
-        slope = np.zeros(len(values))
-        for k in range(len(values)):
-            step = np.zeros(len(values))
-            step[k] = 1e-6 * abs(values[k])
-            if step[k]:
-                slope[k] = (function(values + step)[name][0] - value) / step[k]
-        found[name] = Reported(float(value), float(np.sqrt(slope @ covariance @ slope)), unit.format(**problem.units))
-    return found
+    found = function(values)
+
+    def numbers(x: np.ndarray) -> np.ndarray:
+        return np.array([value for value, _ in function(x).values()])
+
+    J = slopes(numbers, values, np.where(values == 0, 1e-300, np.abs(values)))
+    std = np.sqrt(np.einsum("ip,pq,iq->i", J, covariance, J)) if found else ()
+    return {
+        name: Reported(float(value), float(sigma), unit.format(**problem.units))
+        for (name, (value, unit)), sigma in zip(found.items(), std, strict=True)
+    }
 
 
-def _stages(base: Fitted, best: Fitted, labels: Sequence[str], explored: Explored, problem: Problem) -> list[AxisStage]:
+def _stages(best: Fitted, labels: Sequence[str], explored: Explored) -> list[Stage]:
     """Base model, then one more effect per stage, the largest contribution first."""
-    models, one = [("base", base)], best
-    chain: list[tuple[str, Fitted]] = []
+    models, one, noise = [("base", explored.base)], best, explored.problem.noise
     for label in reversed(labels):
-        chain.append((label.partition("@")[0], one))
+        models.insert(1, (label.partition("@")[0], one))
         rest = explored.without(one, label)
         if rest is None or len(one.labels) == 1:
             break
         one = rest
-    return [
-        AxisStage(
-            name,
-            float(np.sqrt(power(fitted))),
-            None if problem.noise is None else power(fitted) / max(problem.noise, 1e-300),
-        )
-        for name, fitted in (*models, *chain[::-1])
-    ]
-
-
-def _ratios(problem: Problem, best: Fitted, covariance: np.ndarray) -> dict[str, Reported]:
-    names = [name.partition("@")[0] for name in best.model.names]
-    return _propagated(
-        lambda values: problem.ratios(dict(zip(names, values, strict=True))), best.model.values, covariance, problem
-    )
+    over = np.nan if noise is None else 1 / max(noise, 1e-300)
+    return [Stage(name, float(np.sqrt(power(one))), power(one) * over) for name, one in models]
 
 
 def _plain(fitted: Fitted) -> dict[str, Any]:
     model = fitted.model
     return {
-        "base": {name: float(value) for (name, _), value in zip(model.base, model.values, strict=False)},
+        "base": {p.name: float(value) for p, value in zip(model.base, model.values, strict=False)},
         "effects": [{"label": one.label, "values": model.of(one).tolist()} for one in model.effects if not one.outside],
     }
 
 
-def _where(best: Fitted, problem: Problem) -> tuple[dict[str, Any], ...]:
+def _where(best: Fitted, problem: Problem) -> tuple[Where, ...]:
     """The fewest octaves that contain at least half of the residual power, largest first; the mean is in the lowest."""
     f, residual = power_by_line(best)
     octave = np.floor(np.log2(np.maximum(f, np.min(f[f > 0])))).astype(int)
-    found: list[dict[str, Any]] = []
+    found: list[Where] = []
     for k in sorted(np.unique(octave), key=lambda k: -float(residual[octave == k].sum())):
         inside = octave == k
         share = float(residual[inside].sum() / max(residual.sum(), 1e-300))
-        found.append(
-            {
-                "from_Hz": float(f[inside].min()),
-                "to_Hz": float(f[inside].max()),
-                "input": problem.units.get("input", ""),
-                "output": problem.units.get("output", ""),
-                "share": share,
-            }
-        )
-        if sum(one["share"] for one in found) >= 0.5:
+        driven, measured = (problem.units.get(name, "") for name in ("input", "output"))
+        found.append(Where(float(f[inside].min()), float(f[inside].max()), driven, measured, share))
+        if sum(one.share for one in found) >= 0.5:
             break
     return tuple(found)
 
 
-def _pictures(base: Fitted, best: Fitted, stages: Sequence[AxisStage]) -> tuple[Picture, ...]:
+def _pictures(base: Fitted, best: Fitted, stages: Sequence[Stage]) -> tuple[Picture, ...]:
     at = np.arange(len(stages), dtype=float)
     ladder = Picture(
         "Gap on held-out data",
@@ -463,12 +374,11 @@ def percent(share: float) -> str:
 
 def _sentences(
     problem: Problem,
-    verdict: str,
+    verdict: Verdict,
     reported: Sequence[NamedEffect],
     traces: Sequence[NamedEffect],
-    stages: Sequence[AxisStage],
+    stages: Sequence[Stage],
     names: Sequence[Name],
-    refused: Sequence[Name],
     unknown: str,
 ) -> list[str]:
     first, last = percent(stages[0].nrmse), percent(stages[-1].nrmse)
@@ -485,39 +395,25 @@ def _sentences(
             f"{' A part is not explained.' * (verdict != 'explained')}"
         ]
     if traces:
+        told = (f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})" for one in traces)
+        sentences.append(f"Traces, below 1 % of the gap: {'; '.join(told)}.")
+    if any(one.name == "delay" and next(iter(one.parameters.values())).value < 0 for one in (*reported, *traces)):
         sentences.append(
-            "Traces, below 1 % of the gap: "
-            + "; ".join(
-                f"{one.name} ({', '.join(f'{key} {p}' for key, p in one.parameters.items())})" for one in traces
-            )
-            + "."
+            "The delay is negative: the motion comes before the force, so that the force was logged "
+            "late, or the motion early."
         )
-    for one in names:
-        delay = (
-            one.effect.name == "delay"
-            and next(
-                p for e in (*reported, *traces) if e.label == one.effect.label for p in e.parameters.values()
-            ).value
-            < 0
-        )
-        if delay:
-            sentences.append(
-                "The delay is negative: the motion comes before the force, so that the force was logged "
-                "late, or the motion early."
-            )
-        if one.rivals and one.effect.separated_by:
-            sentences.append(
-                f"{one.effect.name}: these data cannot distinguish it from "
-                f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
-                f"{one.effect.separated_by}."
-            )
-    if stages[-1].chi2_per_dof is None:
-        sentences.append("Nothing in these data repeats, so the noise cannot be estimated.")
-    else:
-        sentences.append(
-            f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise."
-        )
+    sentences += [
+        f"{one.effect.name}: these data cannot distinguish it from "
+        f"{' or '.join(dict.fromkeys(r.effect.title for r in one.rivals))}. To distinguish them: "
+        f"{one.effect.separated_by}."
+        for one in names
+        if one.rivals and one.effect.separated_by
+    ]
+    sentences.append(
+        "Nothing in these data repeats, so the noise cannot be estimated."
+        if problem.noise is None
+        else f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise."
+    )
     if unknown:
         sentences.append(f"The residual is most similar to {unknown}, which is not in the library.")
-    lost = {one.effect.name: f"{one.effect.name} reduces the gap, but {one.refused}" for one in refused}
-    return [*sentences, *problem.notes, *(f"Not named: {'; '.join(lost.values())}." for _ in [lost] if lost)]
+    return [*sentences, *problem.notes]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from inspect import signature
 from pathlib import Path
@@ -20,10 +20,10 @@ import numpy as np
 from scipy import signal
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.axis.analysis import Problem, analyse
+from avis_ctrl.gap.axis.analysis import analyse
 from avis_ctrl.gap.axis.levels import levels, read_levels
 from avis_ctrl.gap.axis.mass import drive, oscillator, position_of
-from avis_ctrl.gap.axis.model import Effect
+from avis_ctrl.gap.axis.model import Effect, Problem
 from avis_ctrl.gap.axis.records import Signals
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.axis.search import Progress
@@ -55,9 +55,8 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
     InputError : an unknown kind; an own effect with missing texts, or with the name and place of another one; missing
     or unknown data; arrays that do not fit. ComputationError : no model of this kind fits the data.
     """
-    if kind not in PROBLEMS:
-        raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
-    known = {name: one for name, one in signature(PROBLEMS[kind]).parameters.items() if name not in ("settings",)}
+    _require_kind(kind)
+    known = {name: one for name, one in signature(PROBLEMS[kind]).parameters.items() if name != "settings"}
     if set(data) - set(known) or any(name not in data for name, one in known.items() if one.default is one.empty):
         expected = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
         raise InputError(
@@ -96,10 +95,6 @@ class Reading:
     range_s: tuple[float, float] | None = None
     resample_Hz: float | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """The fields as plain data."""
-        return {**vars(self), "columns": dict(self.columns), "scale": dict(self.scale)}
-
 
 def find_axis_gap_in(
     kind: str,
@@ -128,8 +123,7 @@ def find_axis_gap_in(
     InputError : files, roles or columns that do not fit. ComputationError : as in `find_axis_gap`.
     """
     paths = [path] if isinstance(path, (str, Path)) else list(path)
-    if kind not in PROBLEMS:
-        raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
+    _require_kind(kind)
     if kind == "levels":
         if columns or scale:
             raise InputError(
@@ -137,28 +131,28 @@ def find_axis_gap_in(
                 field="columns",
                 value=dict(columns or scale or {}),
             )
-        return find_axis_gap(
-            kind, campaign=read_levels(paths[0], sample_rate_Hz), transient="none", progress=progress, **options
-        )
+        campaign = read_levels(paths[0], sample_rate_Hz)
+        return find_axis_gap(kind, campaign=campaign, transient="none", progress=progress, **options)
     reading = Reading(dict(columns or {}), dict(scale or {}), sample_rate_Hz, output, range_s, resample_Hz)
-    driven, measured = _roles(kind, reading)
     if kind == "seismometer":
+        driven, measured = _roles(kind, reading)
         campaign = _campaign(paths[0], reading, driven, measured)
         records, refused = sine_records(campaign, driven, measured, dict(reading.scale))
         found = find_axis_gap(kind, progress=progress, **of_sines(records, measured, driven), **options)
-        return replace(
-            found, sentences=(*found.sentences, *(f"Left out: {reason}." for reason in refused), *assumed(reading))
-        )
+        said = (*(f"Left out: {reason}." for reason in refused), *assumed(reading))
+        return replace(found, sentences=(*found.sentences, *said))
     several, rate = signals_in(kind, paths, reading, options.get("band_Hz"))
     try:
         found = find_axis_gap(kind, records=several, rate=rate, progress=progress, **options)
     except InputError as error:
         raise error.in_file(str(paths[0])) from None
-    return replace(
-        found,
-        sentences=(*found.sentences, *assumed(reading, rate)),
-        model={**found.model, "reading": reading.to_json()},
-    )
+    sentences = (*found.sentences, *assumed(reading, rate))
+    return replace(found, sentences=sentences, model={**found.model, "reading": asdict(reading)})
+
+
+def _require_kind(kind: str) -> None:
+    if kind not in PROBLEMS:
+        raise InputError(f"expected one of {', '.join(PROBLEMS)}", field="kind", value=kind)
 
 
 def signals_in(

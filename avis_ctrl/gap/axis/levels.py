@@ -11,17 +11,17 @@ loss of 4/(3 pi) times that reduction, at any frequency. Friction provides less 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import signal
 
 from avis_ctrl.errors import AvisError, InputError
-from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Problem
+from avis_ctrl.gap.axis.records import block_of
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -31,7 +31,6 @@ from avis_ctrl.measurement.frequency_response.resonance import resonance
 from avis_ctrl.measurement.frequency_response.response import FrequencyResponse
 
 RAYLEIGH = 4 / (3 * np.pi)
-REST = ("r", "b0", "b1")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,27 +58,21 @@ class ModeModel(AxisModel):
 
     lines: TwoLevels
 
-    def _predicted(self, block: SpectralBlock, x: np.ndarray) -> np.ndarray:
-        s, lines = 1j * block.omega, self.lines
+    def predicted(self, block: SpectralBlock) -> np.ndarray:
+        s, lines, x = 1j * block.omega, self.lines, self.values
         w = 2 * np.pi * x[0]
         r, b0, b1 = x[2:8:2] + 1j * x[3:8:2]
         change: complex | np.ndarray = 0.0
         gain: complex | np.ndarray = 1.0
         if block.name in lines.high:
-            for one, p in zip(self.effects, split(x, self.effects, len(self.base)), strict=True):
+            for one, p in zip(self.effects, self.parts, strict=True):
                 change = change + (one.dynamics(s / w, p) * w**2 if one.dynamics else 0.0)
                 gain = gain * (one.path(s / w, p) if one.path else 1.0)
         mode = r * 2j * x[1] * w**2 / (s**2 + 2 * x[1] * w * s + w**2 + change)
-        return gain * lines.size * (mode + b0 + b1 * (block.omega / lines.middle - 1))
+        return (gain * lines.size * (mode + b0 + b1 * (block.omega / lines.middle - 1)))[:, None]
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        Y, predicted = self._predicted(block, self.values), partial(self._predicted, block)
-        dY = (
-            central_differences(predicted, self.values, 1e-6 * np.maximum(np.abs(self.values), 1e-3))
-            if derivative
-            else []
-        )
-        return Prediction(Y[:, None, None], np.array(dY).reshape(len(dY), len(Y), 1, 1))
+    def steps(self) -> np.ndarray:
+        return 1e-6 * np.maximum(np.abs(self.values), 1e-3)
 
 
 def level_effects(scatters: bool) -> list[Effect]:
@@ -87,75 +80,47 @@ def level_effects(scatters: bool) -> list[Effect]:
     gain as fractions, of damping as a damping ratio. scatters : the response scatters between realisations as much as a
     static nonlinearity of the drive predicts; a gain that follows the level adds no scatter."""
     sweep = "a sine swept slowly up and down about the mode at several levels"
+    far = "the response far from every mode at several levels"
+    hysteresis = 1 - 1j * RAYLEIGH
+    falling = ("saturation", "a drive or a sensor that saturates")
+    rising, law = ("dead_zone", "a drive or a sensor with a dead zone"), ""
+    if not scatters:
+        falling = ("gain_by_level", "a gain of the drive or the sensor that falls with the level")
+        rising, law = ("gain_by_level", "a gain of the drive or the sensor that rises with the level"), "rising"
+
+    def mode(change: str, by: Callable[[np.ndarray], Any], name: str, title: str, separated_by: str = sweep) -> Effect:
+        parameters = (Parameter(change, "1", 0.0),)
+        return Effect(name, "mode", title, parameters, separated_by, dynamics=lambda s, p: p[0] * by(s))
+
+    def gain(change: str, by: complex, name: str, title: str, separated_by: str = far, law: str = "") -> Effect:
+        parameters = (Parameter(change, "1", 0.0),)
+        return Effect(name, "drive", title, parameters, separated_by, law=law, path=lambda s, p: 1 + by * p[0])
+
     return [
-        Effect(
+        mode(
+            "stiffness_lost",
+            lambda s: -hysteresis,
             "hysteresis",
-            "mode",
             "hysteresis, which softens the mode and adds loss as the level rises",
-            (Parameter("stiffness_lost", "1", 0.0),),
             "the loop of force and displacement at low frequency",
-            dynamics=lambda s, p: -p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s),
         ),
-        Effect(
-            "softening",
-            "mode",
-            "a spring that softens as the level rises",
-            (Parameter("stiffness_lost", "1", 0.0),),
-            sweep,
-            dynamics=lambda s, p: -p[0] * np.ones_like(s),
-        ),
-        Effect(
-            "hardening",
-            "mode",
-            "a spring that stiffens as the level rises",
-            (Parameter("stiffness_gained", "1", 0.0),),
-            sweep,
-            dynamics=lambda s, p: p[0] * np.ones_like(s),
-        ),
-        Effect(
+        mode("stiffness_lost", lambda s: -1, "softening", "a spring that softens as the level rises"),
+        mode("stiffness_gained", lambda s: 1, "hardening", "a spring that stiffens as the level rises"),
+        mode(
+            "damping_ratio_lost",
+            lambda s: -2 * s,
             "friction_damping",
-            "mode",
             "friction, whose damping falls as the level rises",
-            (Parameter("damping_ratio_lost", "1", 0.0),),
-            sweep,
-            dynamics=lambda s, p: -2 * p[0] * s,
         ),
-        Effect(
-            "quadratic_damping",
-            "mode",
-            "a damping that grows with the level",
-            (Parameter("damping_ratio_gained", "1", 0.0),),
-            sweep,
-            dynamics=lambda s, p: 2 * p[0] * s,
-        ),
-        Effect(
-            "saturation" if scatters else "gain_by_level",
-            "drive",
-            "a drive or a sensor that saturates"
-            if scatters
-            else "a gain of the drive or the sensor that falls with the level",
-            (Parameter("gain_lost", "1", 0.0),),
-            "the response far from every mode at several levels",
-            path=lambda s, p: 1 - p[0] * np.ones_like(s),
-        ),
-        Effect(
-            "dead_zone" if scatters else "gain_by_level",
-            "drive",
-            "a drive or a sensor with a dead zone"
-            if scatters
-            else "a gain of the drive or the sensor that rises with the level",
-            (Parameter("gain_gained", "1", 0.0),),
-            "the response far from every mode at several levels",
-            law="" if scatters else "rising",
-            path=lambda s, p: 1 + p[0] * np.ones_like(s),
-        ),
-        Effect(
+        mode("damping_ratio_gained", lambda s: 2 * s, "quadratic_damping", "a damping that grows with the level"),
+        gain("gain_lost", -1, *falling),
+        gain("gain_gained", 1, *rising, law=law),
+        gain(
+            "gain_gained",
+            hysteresis,
             "drive_hysteresis",
-            "drive",
             "hysteresis of the drive (piezo), whose gain and lag grow with the level",
-            (Parameter("gain_gained", "1", 0.0),),
             "the drive's loop of input and output at low frequency",
-            path=lambda s, p: 1 + p[0] * (1 - 1j * RAYLEIGH) * np.ones_like(s),
         ),
         Effect(
             "other_change",
@@ -213,15 +178,6 @@ def levels(
         raise InputError("expected at least 24 lines in the band around a mode", field="band_Hz", value=band)
     ratio = np.mean(np.abs(change[use]) ** 2, axis=0) / np.mean(np.maximum(variance[use], 1e-300), axis=0)
     i, j = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-    problem = _problem(
-        low.at(use),
-        high.at(use),
-        int(i),
-        int(j),
-        mode,
-        sum(r.header.level_V == known[-1] for r in campaign.records) / len(high.inputs),
-        settings,
-    )
     whole = float(np.sqrt(np.mean(np.abs(change / size) ** 2)))
     over = float(np.sqrt(np.mean(np.abs(change) ** 2 / variance)))
     notes = (
@@ -230,7 +186,8 @@ def levels(
         *mode_words,
         f"Fitted: {low.inputs[j]} to {low.outputs[i]}, {band[0]:.5g} to {band[1]:.5g} Hz.",
     )
-    return replace(problem, notes=notes, units={"input": low.inputs[j], "output": low.outputs[i]})
+    realisations = sum(r.header.level_V == known[-1] for r in campaign.records) / len(high.inputs)
+    return _problem(low.at(use), high.at(use), (int(i), int(j)), mode, realisations, notes, settings)
 
 
 def _common(a: FrequencyResponse, b: FrequencyResponse) -> tuple[FrequencyResponse, FrequencyResponse]:
@@ -283,13 +240,13 @@ def _mode(
 def _problem(
     low: FrequencyResponse,
     high: FrequencyResponse,
-    i: int,
-    j: int,
+    entry: tuple[int, int],
     mode: tuple[float, float],
     realisations: float,
+    notes: tuple[str, ...],
     settings: AxisSettings,
 ) -> Problem:
-    omega, n = 2 * np.pi * low.frequency_Hz, len(low.frequency_Hz)
+    (i, j), omega, n = entry, 2 * np.pi * low.frequency_Hz, len(low.frequency_Hz)
     size = float(np.sqrt(np.mean(np.abs(low.value[:, i, j]) ** 2)))
     held = np.arange(n) % 3 == 1
     blocks: dict[bool, list[SpectralBlock]] = {False: [], True: []}
@@ -299,11 +256,7 @@ def _problem(
         for out in (False, True):
             at = held == out
             name = f"{'held out' if out else 'fitted'} {level}"
-            blocks[out].append(
-                SpectralBlock(
-                    name, omega[at], np.zeros((int(at.sum()), 0, 1)), response.value[at, i, j][:, None, None]
-                ).with_noise(variance[at][:, None, None])
-            )
+            blocks[out].append(block_of(name, omega[at], response.value[at, i, j][:, None], variance[at][:, None]))
             if out:
                 noise.append(variance[at])
     change = float(np.sqrt(np.mean(np.abs(high.value[:, i, j] - low.value[:, i, j]) ** 2)))
@@ -317,9 +270,9 @@ def _problem(
     X = np.column_stack([2j * zeta * w**2 / (s**2 + 2 * zeta * w * s + w**2), np.ones(n), omega / middle - 1])
     c = np.linalg.lstsq(X, low.value[:, i, j] / size, rcond=None)[0]
     base = (
-        ("frequency_Hz", "Hz"),
-        ("damping", "1"),
-        *((f"{name}_{part}", "1") for name in REST for part in ("real", "imaginary")),
+        Parameter("frequency_Hz", "Hz", linear=False),
+        Parameter("damping", "1", linear=False),
+        *(Parameter(f"{name}_{part}", "1") for name in ("r", "b0", "b1") for part in ("real", "imaginary")),
     )
     start = np.concatenate([[f0, zeta], np.stack([c.real, c.imag], axis=1).ravel()])
     whole = float(np.mean([np.mean(np.abs(block.Y) ** 2) for block in data[True].blocks]))
@@ -331,10 +284,11 @@ def _problem(
     return Problem(
         "levels",
         ModeModel(lines, base, (), start),
-        (True, True, *(False,) * 6),
         level_effects(scatter > settings.static * change),
         float(np.mean(noise)) / whole,
-        ratios=ratios,
+        notes,
+        {"input": low.inputs[j], "output": low.outputs[i]},
+        ratios,
     )
 
 

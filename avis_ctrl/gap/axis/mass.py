@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 from scipy import signal
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.gap.axis.analysis import Problem
 from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_effects, unnamed_forces
-from avis_ctrl.gap.axis.model import MassModel
+from avis_ctrl.gap.axis.model import MassModel, Parameter, Problem
 from avis_ctrl.gap.axis.records import Lines, Signals
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 
@@ -53,18 +53,14 @@ def drive(
     lines = Lines(records, rate, "force", band, cutoff_Hz, settings)
     start, _ = _least_squares(_flat(lines.A, lines.V), *_flat(lines.F))
     start[0] = start[0] if start[0] > 0 else lines.size / float(np.sqrt(np.mean(np.abs(_flat(lines.A)[0]) ** 2)))
-    model = MassModel(lines, (("M", "{F} s^2/{x}"), ("Fv", "{F} s/{x}")), (), start)
-    noise, notes = repeated(lines, records, "position")
     scale = Scale.of(lines, pitches=True)
     return Problem(
         "drive",
-        model,
-        (True, False),
+        MassModel(lines, (_positive("M", "{F} s^2/{x}"), Parameter("Fv", "{F} s/{x}")), (), start),
         [*drive_effects(scale), *unnamed_forces(lines)],
-        noise,
+        *repeated(lines),
         {"F": "N", "x": "m", "input": "position", "output": "force"},
         lambda v: {"time constant M/Fv": (v["M"] / v["Fv"], "s")} if v["Fv"] > 0 else {},
-        notes,
         {"scale": asdict(scale), "cutoff_Hz": cutoff_Hz, "rate_Hz": rate},
     )
 
@@ -102,8 +98,6 @@ def oscillator(
             cause="no resonance in the band, or columns of another kind",
             next_step="choose a band around one resonance",
         )
-    model = MassModel(lines, (("m", "{F} s^2/{x}"), ("d", "{F} s/{x}"), ("k", "{F}/{x}")), (), start)
-    noise, notes = repeated(lines, records, "force")
 
     def ratios(v: Mapping[str, float]) -> dict[str, tuple[float, str]]:
         w = np.sqrt(v["k"] / v["m"])
@@ -114,17 +108,19 @@ def oscillator(
         return found
 
     scale = Scale.of(lines, pitches=False)
+    base = _positive("m", "{F} s^2/{x}"), Parameter("d", "{F} s/{x}"), _positive("k", "{F}/{x}")
     return Problem(
         "oscillator",
-        model,
-        (True, False, True),
+        MassModel(lines, base, (), start),
         [*oscillator_effects(scale), *unnamed_forces(lines)],
-        noise,
+        *repeated(lines),
         {"F": "u", "x": "y", "input": "u", "output": "y", **(units or {})},
         ratios,
-        notes,
         {"scale": asdict(scale), "rate_Hz": rate},
     )
+
+
+_positive = partial(Parameter, linear=False)
 
 
 def _least_squares(
@@ -174,10 +170,11 @@ def require_oriented(
     residual, positive = fitted(records)
     if positive and residual < settings.no_model:
         return
-    turned, sensible = fitted([Signals(one.name, -one.force, one.position) for one in records])
-    turned = turned if sensible else np.inf
-    swapped, sensible = fitted([Signals(one.name, one.position, one.force) for one in records])
-    swapped = swapped if sensible else np.inf
+    others = (
+        fitted([Signals(one.name, -one.force, one.position) for one in records]),
+        fitted([Signals(one.name, one.position, one.force) for one in records]),
+    )
+    turned, swapped = (left if sensible else np.inf for left, sensible in others)
     if swapped < min(turned, settings.no_model, settings.much_better * residual):
         raise InputError(
             f"the model leaves {100 * residual:.3g} % of these columns and {100 * swapped:.2g} % with "
@@ -207,10 +204,11 @@ def coherent_to(one: Signals, rate: float, settings: AxisSettings) -> float:
     return top
 
 
-def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[float | None, tuple[str, ...]]:
+def repeated(lines: Lines) -> tuple[float | None, tuple[str, ...]]:
     """Noise power of held-out lines over the power of the response, and a sentence, where the signal that drives the
     model repeats; else None. A repeating reference is no evidence, because added forces need not repeat."""
-    one, settings = records[0], lines.settings
+    one, settings = lines.records[0], lines.settings
+    guide, target = ("position", one.force) if lines.solves_for == "force" else ("force", one.position)
     x = getattr(one, guide) - np.mean(getattr(one, guide))
     n, least = len(x), len(x) // 32
     product = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2)[:n]
@@ -221,7 +219,6 @@ def repeated(lines: Lines, records: Sequence[Signals], guide: str) -> tuple[floa
     if not len(good):
         return None, ()
     lag = int(good[0] + np.argmin(apart[good - lags[0]][: max(1, least // 4)]))
-    target = one.force if lines.solves_for == "force" else one.position
     change = np.zeros(n)
     change[: n - lag] = (target[lag:] - target[:-lag]) / np.sqrt(2)
     inside = np.array([start + lines.length <= n - lag for start in lines.starts[0]])

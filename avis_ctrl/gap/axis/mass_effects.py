@@ -96,18 +96,19 @@ def _attached(s: np.ndarray, p: np.ndarray) -> np.ndarray:
     return p[0] * s**2 * inner / (s**2 + inner)
 
 
+def _of_direction(
+    scale: Scale, make: Callable[..., Effect], symbol: str, force: Callable[[np.ndarray], np.ndarray]
+) -> list[Effect]:
+    """A friction as function of the direction of motion, 1 or -1; rounded, for slow motion through rest, where no real
+    friction jumps. make : the effect without its force."""
+    speed, seeds = _shape("v_rounded", "{x}/s", scale.speed), _falling(scale.speed, 10)[1::2]
+    rounded = (symbol, "{F}", lambda m, speed: force(np.tanh(m.v / speed)))
+    return [make((symbol, "{F}", lambda m: force(m.sign))), make(rounded, law="rounded", shaped_by=speed, seeds=seeds)]
+
+
 def _coulomb(scale: Scale, title: str, separated_by: str, location: str) -> list[Effect]:
-    """Friction of constant size; rounded, for slow motion through rest, where no real friction jumps."""
-    friction = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
-    return [
-        friction(("Fc", "{F}", lambda m: m.sign)),
-        friction(
-            ("Fc", "{F}", lambda m, speed: np.tanh(m.v / speed)),
-            law="rounded",
-            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
-            seeds=_falling(scale.speed, 10)[1::2],
-        ),
-    ]
+    make = partial(_force, "coulomb_friction", title, separated_by, low=0.0, location=location, variable="velocity")
+    return _of_direction(scale, make, "Fc", lambda direction: direction)
 
 
 def _delay(s: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -240,6 +241,7 @@ def _spline(x: np.ndarray, knots: np.ndarray, count: int) -> list[np.ndarray]:
 def drive_effects(scale: Scale) -> list[Effect]:
     """Library of effects for a drive."""
     at = partial(_force, location="drive")
+    spring, friction = partial(at, variable="position"), partial(at, low=0.0, variable="velocity")
     found = [
         *_coulomb(scale, "Coulomb friction, a force of constant size against the motion", SLOW, "drive"),
         at(
@@ -248,20 +250,11 @@ def drive_effects(scale: Scale) -> list[Effect]:
             RELEASED,
             ("offset", "{F}", lambda m: np.ones_like(m.v)),
         ),
-        at(
-            "coulomb_asymmetry",
-            "Coulomb friction that differs between the two directions",
-            RELEASED,
-            ("Fc_ahead_less_back", "{F}", lambda m: np.abs(m.sign) / 2),
-        ),
-        at(
-            "coulomb_asymmetry",
-            "Coulomb friction that differs between the two directions",
-            RELEASED,
-            ("Fc_ahead_less_back", "{F}", lambda m, speed: np.abs(np.tanh(m.v / speed)) / 2),
-            law="rounded",
-            shaped_by=_shape("v_rounded", "{x}/s", scale.speed),
-            seeds=_falling(scale.speed, 10)[1::2],
+        *_of_direction(
+            scale,
+            partial(at, "coulomb_asymmetry", "Coulomb friction that differs between the two directions", RELEASED),
+            "Fc_ahead_less_back",
+            lambda direction: np.abs(direction) / 2,
         ),
         at(
             "viscous_asymmetry",
@@ -269,36 +262,30 @@ def drive_effects(scale: Scale) -> list[Effect]:
             "several constant speeds in each direction",
             ("Fv_ahead_less_back", "{F} s/{x}", lambda m: np.abs(m.v) / 2),
         ),
-        at(
+        friction(
             "quadratic_drag",
             "a drag that grows with the square of the speed",
             "several constant speeds",
             ("c2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
-            low=0.0,
-            variable="velocity",
         ),
-        at(
+        spring(
             "stiffness",
             "a spring to the ground (a cable, a hose)",
             AT_REST,
             ("k", "{F}/{x}", lambda m: m.q),
             ("force_at_zero", "{F}", lambda m: np.ones_like(m.q)),
-            variable="position",
         ),
-        at(
+        spring(
             "cubic_stiffness",
             "a spring that stiffens with the cube of the displacement from mid travel",
             AT_REST,
             ("k3", "{F}/{x}^3", lambda m: (m.q - m.middle) ** 3),
-            variable="position",
         ),
-        at(
+        friction(
             "stribeck_friction",
             "Stribeck friction, which falls as the drive starts to move",
             SLOW,
             ("Fs", "{F}", lambda m, speed: m.sign * np.exp(-((m.v / speed) ** 2))),
-            low=0.0,
-            variable="velocity",
             shaped_by=_shape("v_s", "{x}/s", scale.speed / 2),
             seeds=_falling(scale.speed)[1:],
         ),
@@ -396,40 +383,27 @@ def _pitches(lines: Lines, few: int = 2) -> list[float]:
 def oscillator_effects(scale: Scale) -> list[Effect]:
     """Library of effects for an oscillator."""
     at, drive = partial(_force, location="oscillator"), partial(_force, location="input", variable="input")
+    spring, damping = partial(at, variable="position"), partial(at, low=0.0, variable="velocity")
     far = "the response far above the resonance at several levels"
     level = _shape("level", "{F}", scale.force, 0.01)
     found = [
-        at(
-            "cubic_stiffness",
-            "cubic stiffness, a restoring force k3 y^3",
-            SWEEP,
-            ("k3", "{F}/{x}^3", lambda m: m.q**3),
-            variable="position",
+        spring(
+            "cubic_stiffness", "cubic stiffness, a restoring force k3 y^3", SWEEP, ("k3", "{F}/{x}^3", lambda m: m.q**3)
         ),
-        at(
+        spring(
             "quadratic_stiffness",
             "quadratic stiffness, a restoring force k2 y^2",
             "the mean displacement under a sine at several levels",
             ("k2", "{F}/{x}^2", lambda m: m.q**2),
-            variable="position",
         ),
         *_stops(scale.reach, "oscillator", lambda m: m.q),
-        at(
+        damping(
             "quadratic_damping",
             "quadratic damping, a force d2 |y'| y'",
             DECAY,
             ("d2", "{F} s^2/{x}^2", lambda m: np.abs(m.v) * m.v),
-            low=0.0,
-            variable="velocity",
         ),
-        at(
-            "cubic_damping",
-            "cubic damping, a force d3 y'^3",
-            DECAY,
-            ("d3", "{F} s^3/{x}^3", lambda m: m.v**3),
-            low=0.0,
-            variable="velocity",
-        ),
+        damping("cubic_damping", "cubic damping, a force d3 y'^3", DECAY, ("d3", "{F} s^3/{x}^3", lambda m: m.v**3)),
         *_coulomb(scale, "friction damping, a force of constant size against the motion", DECAY, "oscillator"),
         at(
             "position_damping",

@@ -11,8 +11,9 @@ Z as well. Otherwise the force would predict the noise of the same q from which 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.records import Lines, Shape
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.priors import Priors
+from avis_ctrl.identification.response import Driven
 from avis_ctrl.identification.spectral_block import SpectralBlock
 
 Curve = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Ratios = Callable[[Mapping[str, float]], Mapping[str, tuple[float, str]]]
 
 
 @dataclass(frozen=True)
@@ -80,30 +83,29 @@ class Effect:
         """Name and location."""
         return f"{self.name}@{self.location}"
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its parameters in a model."""
+        return tuple(f"{p.name}@{self.label}" for p in self.parameters)
+
+    @property
+    def sizes(self) -> list[str]:
+        """Names, as in a model, of the parameters in which it is linear."""
+        return [name for name, p in zip(self.names, self.parameters, strict=True) if p.linear]
+
+    def reported(self, values: np.ndarray) -> Mapping[str, tuple[float, str]]:
+        """Quantities with units that are reported for these values of the parameters."""
+        if self.derived:
+            return self.derived(values)
+        return {p.name: (value, p.unit) for p, value in zip(self.parameters, values.tolist(), strict=True)}
+
     def initial_values(self) -> list[np.ndarray]:
         """Initial values of fits; zero by default."""
         return [np.array(one) for one in self.seeds] or [np.zeros(len(self.parameters))]
 
 
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """Predicted Y (n, n_y, 1) and its derivatives dY (p, n, n_y, 1)."""
-
-    Y: np.ndarray
-    dY: np.ndarray
-
-
-def split(values: np.ndarray, effects: Sequence[Effect], base: int) -> list[np.ndarray]:
-    """Parameter values of each effect."""
-    found, at = [], base
-    for one in effects:
-        found.append(values[at : at + len(one.parameters)])
-        at += len(one.parameters)
-    return found
-
-
 def central_differences(
-    function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float]
+    function: Callable[[np.ndarray], np.ndarray], p: np.ndarray, steps: Sequence[float] | np.ndarray
 ) -> list[np.ndarray]:
     """Derivative of a function with respect to each of its parameters."""
     return [(function(p + h) - function(p - h)) / (2 * h.sum()) for h in np.diag(steps)]
@@ -122,34 +124,44 @@ def summed(parts: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class AxisModel:
-    """A base model with effects. base : names and units of the base parameters; the first one is positive."""
+    """A base model with effects. base : its parameters, of which those that are not linear are positive.
+
+    A subclass defines `predicted`, and `steps` for its derivatives.
+    """
 
     lines: Any
-    base: tuple[tuple[str, str], ...]
+    base: tuple[Parameter, ...]
     effects: tuple[Effect, ...]
     values: np.ndarray
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters: those of the base model, then those of the effects."""
-        return (
-            *(name for name, _ in self.base),
-            *(f"{p.name}@{one.label}" for one in self.effects for p in one.parameters),
-        )
+        return (*(p.name for p in self.base), *(name for one in self.effects for name in one.names))
 
     @property
     def units(self) -> tuple[str, ...]:
         """Units of all parameters."""
-        return (*(unit for _, unit in self.base), *(p.unit for one in self.effects for p in one.parameters))
+        return (*(p.unit for p in self.base), *(p.unit for one in self.effects for p in one.parameters))
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the effects."""
         return tuple(one.label for one in self.effects)
 
+    @property
+    def parts(self) -> list[np.ndarray]:
+        """Parameter values of each effect."""
+        ends = np.cumsum([len(self.base), *(len(one.parameters) for one in self.effects)])
+        return np.split(self.values, ends[:-1])[1:]
+
+    def effect(self, label: str) -> Effect:
+        """The effect with this label."""
+        return self.effects[self.labels.index(label)]
+
     def of(self, effect: Effect) -> np.ndarray:
         """Parameter values of an effect."""
-        return split(self.values, self.effects, len(self.base))[self.effects.index(effect)]
+        return self.parts[self.effects.index(effect)]
 
     def at(self, values: np.ndarray) -> AxisModel:
         """The model with other values of its parameters."""
@@ -163,26 +175,32 @@ class AxisModel:
 
     def without(self, label: str) -> AxisModel:
         """The model without one of its effects."""
-        parts = split(self.values, self.effects, len(self.base))
         kept = [k for k, one in enumerate(self.effects) if one.label != label]
         return replace(
             self,
             effects=tuple(self.effects[k] for k in kept),
-            values=np.concatenate([self.values[: len(self.base)], *(parts[k] for k in kept)]),
+            values=np.concatenate([self.values[: len(self.base)], *(self.parts[k] for k in kept)]),
         )
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        """Predicted outputs on the lines of a block, and their derivatives."""
+    def predicted(self, block: SpectralBlock) -> np.ndarray:
+        """(n, n_y) outputs on the lines of a block."""
         raise NotImplementedError
+
+    def steps(self) -> np.ndarray:
+        """(p,) steps of the central differences."""
+        raise NotImplementedError
+
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
+        """Predicted outputs (n, n_y, 1) on the lines of a block, and their derivatives (p, n, n_y, 1)."""
+        Y, dY = self.predicted(block), []
+        if derivative:
+            dY = central_differences(lambda x: replace(self, values=x).predicted(block), self.values, self.steps())
+        return Driven(Y[:, :, None], np.reshape(dY, (len(dY), *Y.shape, 1)))
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         """(n, n_y, 1) part of the prediction that may have a relative error, constant over a band: all of it.
         Departures of a real force from its law are distortion."""
         return self.answer(block, None, False).Y
-
-    def columns(self, block: SpectralBlock, derivative: bool = True) -> np.ndarray:
-        """(p, n, n_y, 1) derivatives of the prediction."""
-        return self.answer(block, None, derivative).dY
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,12 +222,12 @@ class MassModel(AxisModel):
             ]
         )
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        n, s, around = len(self.base), 1j * block.omega, self.lines.around(block.omega)
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
+        n, s, around, several = len(self.base), 1j * block.omega, self.lines.around(block.omega), self.parts
         A, V, Q, F = (
             self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q, self.lines.F)
         )
-        regressors, several = (A, V, Q)[:n], split(self.values, self.effects, n)
+        regressors = (A, V, Q)[:n]
         Z = sum(x * s ** (2 - k) for k, x in enumerate(self.values[:n]))
         R = sum(x * one for x, one in zip(self.values, regressors, strict=False))
         P, forces = np.ones(around.shape, complex), {}
@@ -225,7 +243,7 @@ class MassModel(AxisModel):
         D = -P[:, 1] if drive else Z
         Y = summed(F if drive else Q) + f / D
         if not derivative:
-            return Prediction(Y[:, None, None], np.empty((0, len(s), 1, 1)))
+            return Driven(Y[:, None, None], np.empty((0, len(s), 1, 1)))
 
         def force(column: np.ndarray, z: np.ndarray | float = 0.0) -> np.ndarray:
             return -summed(column) / D - (0.0 if drive else f / D**2 * z)
@@ -246,42 +264,61 @@ class MassModel(AxisModel):
             if one.path:
                 dP = [P / one.path(around, p) * slope for slope in slopes(one.path, around, p)]
                 dY += [summed(slope * F) / D + (f / D**2 * slope[:, 1] if drive else 0.0) for slope in dP]
-        return Prediction(Y[:, None, None], np.array(dY)[:, :, None, None])
+        return Driven(Y[:, None, None], np.array(dY)[:, :, None, None])
 
 
-def base_priors(model: AxisModel, positive: Sequence[bool], settings: AxisSettings = SETTINGS) -> Priors:
-    """Priors of the base parameters, wide enough to have no influence: a factor of e, or as much as the whole
-    response."""
-    v = model.values[: len(model.base)]
-    size = sizes(model, list(range(len(v))))
-    up = np.asarray(positive, bool)
-    return Priors(
-        tuple(name for name, _ in model.base), np.where(up, v, 0.0), np.where(up, settings.shape_spread, size), up
-    )
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A base model at its initial values, with the effects that it may lack.
+
+    noise : noise power on the held-out lines over that of the response; None if it cannot be estimated. notes :
+    sentences on the data. units : of {F} and {x}, and names of input and output. ratios : function from values by name
+    to derived quantities with units. plain : base model data that a simulation needs.
+    """
+
+    kind: str
+    model: AxisModel
+    effects: Sequence[Effect]
+    noise: float | None
+    notes: tuple[str, ...]
+    units: Mapping[str, str]
+    ratios: Ratios = lambda values: {}
+    plain: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def library(self) -> list[Effect]:
+        """Effects that may be named."""
+        return [one for one in self.effects if not one.outside]
+
+    @cached_property
+    def unnamed(self) -> list[Effect]:
+        """Functions that represent whatever the library lacks."""
+        return [one for one in self.effects if one.outside]
 
 
 def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
     """Parameter values that change the prediction by as much as the whole response, r.m.s. over the fitted lines."""
     power, total = np.zeros(len(at)), 0
     for block in model.lines.fitted.blocks:
-        dY = model.columns(block)[list(at)]
+        dY = model.answer(block).dY[list(at)]
         scale = float(np.sqrt(np.mean(np.abs(block.Y) ** 2)))
         power += np.sum(np.abs(dY / scale) ** 2, axis=(1, 2, 3))
         total += block.Y.size
     return 1 / np.sqrt(np.maximum(power / total, 1e-300))
 
 
-def effect_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
-    """Priors of the parameters of a model's last effect, at its initial values."""
-    one = model.effects[-1]
-    n = len(one.parameters)
-    start, linear = model.values[-n:], np.array([p.linear for p in one.parameters], bool)
-    size = sizes(model, list(range(len(model.values) - n, len(model.values))))
+def added_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
+    """Priors of the parameters of a model's last effect, or of the base of a model without effects, about their initial
+    values. They are so wide that they have no influence: a factor of e, or as much as the whole response."""
+    names, parameters = model.names, model.base
+    if model.effects:
+        names, parameters = model.effects[-1].names, model.effects[-1].parameters
+    n, linear = len(model.values), np.array([p.linear for p in parameters], bool)
     return Priors(
-        tuple(f"{p.name}@{one.label}" for p in one.parameters),
-        np.where(linear, 0.0, start),
-        np.where(linear, size, settings.shape_spread),
+        names,
+        np.where(linear, 0.0, model.values[-len(names) :]),
+        np.where(linear, sizes(model, range(n - len(names), n)), settings.shape_spread),
         ~linear,
-        np.array([p.low for p in one.parameters]),
-        np.array([p.high for p in one.parameters]),
+        np.array([p.low for p in parameters]),
+        np.array([p.high for p in parameters]),
     )

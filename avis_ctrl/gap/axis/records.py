@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from scipy import fft, signal
@@ -99,7 +99,9 @@ class Lines:
     ----------
     s : (k,) j omega [rad/s]. fitted, held : data for the likelihood; U of the blocks is empty, because the model keeps
     its own inputs by block name. rows : by block, record and number of each of its segments. over : samples of the
-    motion per measured sample.
+    motion per measured sample. of : (segments, k, 3) by record, from a function of the motion and values of its shape
+    parameters. linear_part : from the same, the coefficients of q and v in its best linear approximation. Both are
+    computed once.
 
     Raises
     ------
@@ -144,8 +146,8 @@ class Lines:
         top = min(band_Hz[1], 0.45 * rate)
         self.over = max(2, int(np.ceil(2 * settings.oversampled * top / rate)))
         self.motion = [self._motion(one) for one in self.records]
-        self.kept: dict[Hashable, tuple[Shape, list[np.ndarray]]] = {}
-        self.linear: dict[Hashable, tuple[Shape, tuple[float, float]]] = {}
+        self.of: Callable[..., list[np.ndarray]] = cache(self._of)
+        self.linear_part: Callable[..., tuple[float, float]] = cache(self._linear_part)
         self.picked: dict[Hashable, tuple[Sequence[np.ndarray], np.ndarray]] = {}
         self.F = [self.transform(one.force, i) for i, one in enumerate(self.records)]
         self.Q, self.V, self.A = (
@@ -199,25 +201,13 @@ class Lines:
         """(n, 3) j omega [rad/s] of the three terms of lines (n,)."""
         return 1j * (omega[:, None] + 2 * np.pi * self.rate / self.length * np.array([-1, 0, 1]))
 
-    def of(self, shape: Shape, by: tuple[float, ...] = ()) -> list[np.ndarray]:
-        """(segments, k, 3) by record: a function of the motion with shape parameters `by`; computed once."""
-        key = id(shape), by
-        if key not in self.kept:
-            self.kept[key] = (
-                shape,
-                [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i) for i, m in enumerate(self.motion)],
-            )
-        return self.kept[key][1]
+    def _of(self, shape: Shape, by: tuple[float, ...] = ()) -> list[np.ndarray]:
+        return [self.transform(np.broadcast_to(shape(m, *by), m.q.shape), i) for i, m in enumerate(self.motion)]
 
-    def linear_part(self, shape: Shape, by: tuple[float, ...] = ()) -> tuple[float, float]:
-        """Coefficients of q and v in the best linear approximation of a function of the motion."""
-        key = id(shape), by
-        if key not in self.linear:
-            m, fit, step = self._linear
-            N = np.broadcast_to(shape(m, *by), m.q.shape)[::step]
-            alpha, beta, _ = fit @ N
-            self.linear[key] = shape, (float(alpha), float(beta))
-        return self.linear[key][1]
+    def _linear_part(self, shape: Shape, by: tuple[float, ...] = ()) -> tuple[float, float]:
+        m, fit, step = self._linear
+        alpha, beta, _ = fit @ np.broadcast_to(shape(m, *by), m.q.shape)[::step]
+        return float(alpha), float(beta)
 
     @cached_property
     def _linear(self) -> tuple[Motion, np.ndarray, int]:
@@ -253,19 +243,17 @@ class Lines:
             inside = level == one
             self.rows[name] = tuple(np.array(at)[inside].T)
             omega = np.tile(self.s.imag, int(inside.sum()))
-            Y = self.pick(self.Y, name)[:, None, None]
-            blocks.append(
-                SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y).with_noise(
-                    floor_of(omega, Y, self.settings)
-                )
-            )
+            Y = self.pick(self.Y, name)[:, None]
+            floor = self.settings.floor**2 * float(np.mean(np.abs(Y) ** 2))
+            blocks.append(block_of(name, omega, Y, np.full(Y.shape, floor)))
             levels.append(float(2.0**one * loud.max()))
         return Data(tuple(blocks), tuple(levels))
 
 
-def floor_of(omega: np.ndarray, Y: np.ndarray, settings: AxisSettings) -> np.ndarray:
-    """(n, 1, 1) minimum noise variance of every line."""
-    return np.full((len(omega), 1, 1), settings.floor**2 * float(np.mean(np.abs(Y) ** 2)))
+def block_of(name: str, omega: np.ndarray, Y: np.ndarray, variance: np.ndarray) -> SpectralBlock:
+    """Lines of outputs (n, n_y) with independent noise (n, n_y); the model itself keeps its inputs."""
+    block = SpectralBlock(name, omega, np.zeros((len(omega), 0, 1)), Y[:, :, None])
+    return block.with_noise(variance[:, :, None] * np.eye(Y.shape[1]))
 
 
 def _thinned(k: np.ndarray, f: np.ndarray, settings: AxisSettings) -> np.ndarray:

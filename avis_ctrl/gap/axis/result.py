@@ -6,21 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from avis_ctrl.gap.effects.base import Reported
-from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.result import Findings, NamedEffect, Remainder, Stage, Verdict, Where
 from avis_ctrl.measurement.gates.finding import Picture
-
-
-@dataclass(frozen=True)
-class AxisStage:
-    """A model on data that no fit has used. nrmse : norm of the error over that of the measured response.
-    chi2_per_dof : mean square of the error over that of the measured noise; None if the noise is unknown."""
-
-    name: str
-    nrmse: float
-    chi2_per_dof: float | None
 
 
 @dataclass(frozen=True)
@@ -33,68 +21,42 @@ class RunnerUp:
 
 
 @dataclass(frozen=True, eq=False)
-class AxisGap:
+class AxisGap(Findings):
     """What is missing from a model of one axis.
 
-    verdict : "none", "explained", "partly explained" or "unexplained" (contract of `avis gap`). effects : the named
-    ones, largest contribution first; traces : those with a negligible contribution. stages : base model, then one more
-    effect each. where : bands with most of the residual of the last stage. sentences : the first is the summary.
-    parameters : base parameters of the updated model. model : the updated and the base model as plain data, as read by
-    `simulation`.
+    effects : the named ones, largest contribution first; traces : those with a negligible contribution. stages : base
+    model, then one more effect each, on data that no fit has used; what depends on the noise is nan if the noise is
+    unknown. remaining : bands with most of the residual of the last stage. left : its size. sentences : the first is
+    the summary. parameters : base parameters of the updated model. ratios : derived from them. model : the updated and
+    the base model as plain data, as read by `simulation`.
     """
 
     kind: str
-    verdict: str
+    verdict: Verdict
     effects: tuple[NamedEffect, ...]
     traces: tuple[NamedEffect, ...]
-    stages: tuple[AxisStage, ...]
-    where: tuple[dict[str, Any], ...]
+    stages: tuple[Stage, ...]
+    remaining: tuple[Where, ...]
+    left: Remainder
     sentences: tuple[str, ...]
     next_experiment: str | None
     parameters: Mapping[str, Reported]
     ratios: Mapping[str, Reported]
     runners_up: tuple[RunnerUp, ...]
-    over_noise: float | None
-    share_left: float
     pictures: tuple[Picture, ...] = ()
     model: dict[str, Any] = field(default_factory=dict)
     seconds: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data in the shape of the contract's gap.json; numbers that are not finite become None."""
-        remaining = {
-            "nrmse": number(self.stages[-1].nrmse),
-            "over_noise": number(self.over_noise),
-            "share": number(self.share_left),
-            "where": list(self.where),
-            "grows_with_level": None,
-        }
+        """gap.json of the contract, format "avis-gap-axis" version 2; numbers may be nan."""
         return {
             "format": "avis-gap-axis",
             "version": 2,
             "kind": self.kind,
-            "verdict": self.verdict,
-            "effects": [one.to_json() for one in self.effects],
-            "traces": [one.to_json() for one in self.traces],
-            "gap": [
-                {"stage": one.name, "nrmse": number(one.nrmse), "chi2_per_dof": number(one.chi2_per_dof)}
-                for one in self.stages
-            ],
-            "where": list(self.where),
-            "remaining": remaining,
-            "next_experiment": self.next_experiment,
-            "base_parameters": _plain(self.parameters),
-            "ratios": _plain(self.ratios),
+            **self.findings(),
+            "base_parameters": {name: one.to_json() for name, one in self.parameters.items()},
+            "ratios": {name: one.to_json() for name, one in self.ratios.items()},
             "runners_up": [vars(one) for one in self.runners_up],
             "sentences": list(self.sentences),
             "seconds": round(self.seconds, 2),
         }
-
-
-def _plain(several: Mapping[str, Reported]) -> dict[str, Any]:
-    return {name: {"value": number(p.value), "std": number(p.std), "unit": p.unit} for name, p in several.items()}
-
-
-def number(value: float | None) -> float | None:
-    """The value as a float; None if it is not finite."""
-    return None if value is None or not np.isfinite(value) else float(value)

@@ -10,17 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import combinations
 
 import numpy as np
 
-from avis_ctrl.errors import AvisError
-from avis_ctrl.gap.axis.model import AxisModel, Effect, effect_priors
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Problem, added_priors
 from avis_ctrl.gap.axis.settings import AxisSettings
 from avis_ctrl.gap.probability import larger_odds
 from avis_ctrl.gap.score import reduction
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, unseen
+from avis_ctrl.gap.search import fit_or_none
+from avis_ctrl.gap.validation import by_information
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile, first_variances, fit, unseen
 from avis_ctrl.identification.maximum_likelihood import as_real, whitened
 from avis_ctrl.identification.priors import Priors
 from avis_ctrl.identification.single_axis.fit import not_below
@@ -32,35 +33,50 @@ Cells = dict[tuple[int, int, bool], float]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Effects with initial values for a fit, the reduction of the sum of squares that the score test predicts, and
-    their whitened directions (k, N), orthogonal to those of the current model."""
+    """Effects with initial values for a fit.
+
+    directions : (k, N) whitened, orthogonal to those of the current model. along : (k,) products with the residual.
+    """
 
     effects: tuple[tuple[Effect, np.ndarray], ...]
-    reduction: float
     directions: np.ndarray
+    along: np.ndarray
+
+    @cached_property
+    def reduction(self) -> float:
+        """Reduction of the sum of squares that the score test predicts."""
+        return reduction(self.directions @ self.directions.T, self.along).chi2
+
+    @property
+    def first(self) -> Effect:
+        """The effect, or the first one of a pair."""
+        return self.effects[0][0]
 
 
 @dataclass(eq=False)
 class Explored:
     """Fits by the set of their effects' labels, so that the order in which effects are found has no influence.
 
-    cells : `cells` of a fit, for the fitted or the held-out data; computed once.
+    base : the fit without effects. cells : `cells` of a fit, for the fitted or the held-out data; computed once.
     """
 
-    data: Data
+    problem: Problem
     settings: AxisSettings
     fits: dict[frozenset[str], Fitted | None] = field(default_factory=dict)
+    base: Fitted = field(init=False)
     cells: Callable[[Fitted, bool], Cells] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.cells = cache(partial(cells, settings=self.settings))
+        model, data, settings = self.problem.model, self.data, self.settings
+        priors = added_priors(model, settings)
+        self.base = fit(model, priors, priors.z(model.values), data, first_variances(data, settings), settings)
+        self.fits[frozenset()] = self.base
+        self.cells = cache(partial(cells, settings=settings))
 
-    def base(self, model: AxisModel, priors: Priors) -> Fitted:
-        """The fit without effects."""
-        found = fit(
-            model, priors, priors.z(model.values), self.data, first_variances(self.data, self.settings), self.settings
-        )
-        self.fits[frozenset()] = found
+    @property
+    def data(self) -> Data:
+        """The lines that are fitted."""
+        found: Data = self.problem.model.lines.fitted
         return found
 
     def with_effects(self, now: Fitted, added: Sequence[tuple[Effect, np.ndarray]]) -> Fitted | None:
@@ -70,9 +86,9 @@ class Explored:
             model, priors, z = now.model, now.priors, now.z
             for one, values in added:
                 model = model.with_effect(one, values)
-                own = effect_priors(model, self.settings)
+                own = added_priors(model, self.settings)
                 priors, z = priors.followed_by(own), np.concatenate([z, own.z(values)])
-            self.fits[labels] = self._try(model, priors, z, now)
+            self.fits[labels] = self._fit(model, priors, z, now)
         return self.fits[labels]
 
     def without(self, now: Fitted, label: str) -> Fitted | None:
@@ -81,15 +97,12 @@ class Explored:
         if labels not in self.fits:
             model = now.model.without(label)
             rows = [now.priors.names.index(name) for name in model.names]
-            self.fits[labels] = self._try(model, now.priors.of(model.names), now.z[rows], now)
+            self.fits[labels] = self._fit(model, now.priors.of(model.names), now.z[rows], now)
         return self.fits[labels]
 
-    def _try(self, model: AxisModel, priors: Priors, z: np.ndarray, like: Fitted) -> Fitted | None:
-        try:
-            with np.errstate(all="ignore"):
-                return fit(model, priors, z, self.data, like.variances, self.settings)
-        except (AvisError, np.linalg.LinAlgError, FloatingPointError):
-            return None
+    def _fit(self, model: AxisModel, priors: Priors, z: np.ndarray, like: Fitted) -> Fitted | None:
+        with np.errstate(all="ignore"):
+            return fit_or_none(like, model, priors, z, self.data, self.settings)
 
     def held_out(self, one: Fitted) -> float:
         """Log-likelihood of the held-out data."""
@@ -107,105 +120,94 @@ class Explored:
         beside = one.log_evidence - other.log_evidence - sum(mine.values()) + sum(theirs.values())
         return larger_odds(mine | self.cells(one, True), theirs | self.cells(other, True), beside)
 
+    def candidates(self, now: Fitted, effects: Sequence[Effect]) -> list[Candidate]:
+        """Every effect that the model does not contain, at its best seed, the largest reduction first."""
+        profile, taken = Profile(now, self.data, self.settings), {one.key for one in now.model.effects}
+        found = [
+            max((self._candidate(profile, one, seed) for seed in one.initial_values()), key=lambda c: c.reduction)
+            for one in effects
+            if one.key not in taken
+        ]
+        return sorted(found, key=lambda c: -c.reduction)
 
-def candidates(now: Fitted, data: Data, effects: Sequence[Effect]) -> list[Candidate]:
-    """Every effect that the model does not contain, at its best seed, the largest reduction first."""
-    J, e = now.J, now.e
-    Q = np.linalg.qr(J.T)[0]
-    residual, taken, found = e - Q @ (Q.T @ e), {one.key for one in now.model.effects}, []
-    for one in effects:
-        if one.key in taken:
-            continue
-        best = None
-        for seed in one.initial_values():
-            C = directions(now, data, one, seed)
-            C = C - (C @ Q) @ Q.T
-            reduced = reduction(C @ C.T, C @ residual).chi2
-            if best is None or reduced > best.reduction:
-                best = Candidate(((one, seed),), reduced, C)
-        if best is not None:
-            found.append(best)
-    return sorted(found, key=lambda c: -c.reduction)
+    def _candidate(self, profile: Profile, one: Effect, seed: np.ndarray) -> Candidate:
+        """Along the derivatives by the parameters of an effect at its seed; only the linear ones, if there are any."""
+        now = profile.fitted
+        model = now.model.with_effect(one, seed)
+        rows = [
+            as_real(whitened(L[:, None], model.answer(block).dY[-len(seed) :]))
+            for block, L in zip(self.data.blocks, now.weights.L, strict=True)
+        ]
+        linear = np.array([p.linear for p in one.parameters], bool)
+        C = profile.free(np.concatenate(rows, axis=1)[linear | (not linear.any())])
+        return Candidate(((one, seed),), C, C @ profile.e)
 
+    def in_place_of(self, now: Fitted, label: str, effects: Sequence[Effect], most: int) -> list[tuple[Effect, Fitted]]:
+        """Other effects in the place of one, and their fits; at most `most`, promising to first order."""
+        rest, own = self.without(now, label), now.model.effect(label).key
+        found = [] if rest is None else self.candidates(rest, effects)
+        known = max((c.reduction for c in found if c.first.key == own), default=0.0)
+        near = [c for c in found[:most] if c.reduction >= 0.5 * self.settings.not_far_behind * known]
+        fits = [(c.first, self.with_effects(rest, c.effects)) for c in near if rest is not None]
+        return [(effect, one) for effect, one in fits if one is not None and not at_an_edge(one)]
 
-def directions(now: Fitted, data: Data, one: Effect, seed: np.ndarray) -> np.ndarray:
-    """(k, N) whitened derivatives of the prediction with respect to an effect's parameters at its seed; only those of
-    linear parameters, if there are any."""
-    model = now.model.with_effect(one, seed)
-    rows = []
-    for block, L in zip(data.blocks, now.weights.L, strict=True):
-        dY = model.columns(block)[-len(seed) :]
-        rows.append(as_real(whitened(L[:, None], dY)))
-    C = now.weights.flatten(np.concatenate(rows, axis=1))
-    linear = np.array([p.linear for p in one.parameters], bool)
-    return C[linear | (not linear.any())]
-
-
-def shortlist(found: Sequence[Candidate], residual: np.ndarray, settings: AxisSettings) -> list[Candidate]:
-    """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
-    singles = [c for c in found if c.reduction > 2 * settings.certain]
-    one_law: dict[str, Candidate] = {}
-    for c in found:
-        one_law.setdefault(c.effects[0][0].key, c)
-    pairs = []
-    for a, b in combinations(one_law.values(), 2):
-        C = np.vstack([a.directions, b.directions])
-        reduced = reduction(C @ C.T, C @ residual).chi2
-        if reduced > a.reduction + b.reduction + 2 * settings.certain:
-            pairs.append(Candidate((*a.effects, *b.effects), reduced, C))
-    pairs.sort(key=lambda c: -c.reduction)
-    return [*singles[: settings.refits], *pairs[: settings.pairs]]
+    def shortlist(self, now: Fitted) -> list[Candidate]:
+        """The best single effects, and the best pairs whose joint reduction exceeds the sum of the single ones."""
+        settings, found, one_law = self.settings, self.candidates(now, self.problem.library), dict[str, Candidate]()
+        for c in found:
+            one_law.setdefault(c.first.key, c)
+        pairs = []
+        for a, b in combinations(one_law.values(), 2):
+            directions, along = np.vstack([a.directions, b.directions]), np.concatenate([a.along, b.along])
+            both = Candidate((*a.effects, *b.effects), directions, along)
+            if both.reduction > a.reduction + b.reduction + 2 * settings.certain:
+                pairs.append(both)
+        singles = [c for c in found if c.reduction > 2 * settings.certain]
+        pairs.sort(key=lambda c: -c.reduction)
+        return [*singles[: settings.refits], *pairs[: settings.pairs]]
 
 
-def search(base: Fitted, explored: Explored, effects: Sequence[Effect], progress: Progress) -> Fitted:
+def search(explored: Explored, progress: Progress) -> Fitted:
     """The model with the effects that the data support.
 
     An effect is added if the score rises by more than the number of candidates explains and held-out data confirm it.
     It is dropped if other effects have made it redundant. When no more effects are added, each is compared with every
     other one in its place, and the search continues if one is better.
     """
-    settings, now, revisions = explored.settings, base, 0
-    effects = [one for one in effects if not one.outside]
-    price = settings.certain + math.log(len(effects))
+    settings, now, revisions = explored.settings, explored.base, 0
+    price = settings.certain + math.log(len(explored.problem.library))
     while True:
         progress(f"candidates beside {', '.join(now.labels) or 'the base model'}")
         tried = [now]
         if len(now.labels) < settings.longest:
-            for c in shortlist(candidates(now, explored.data, effects), now.e, settings):
+            for c in explored.shortlist(now):
                 one = explored.with_effects(now, c.effects)
                 if one is not None and not at_an_edge(one):
                     tried.append(one)
         best = max(tried, key=lambda one: explored.score(one) - (len(one.labels) - len(now.labels)) * price)
         if best is not now:
-            best = _without_idle(_revised(best, explored, effects, laws_only=True), explored)
+            best = _without_idle(_revised(best, explored, laws_only=True), explored)
         if (
             best is now
             or explored.score(best) <= explored.score(now)
             or (explored.held_out(best) <= explored.held_out(now))
         ):
             revisions += 1
-            best = _without_idle(_revised(now, explored, effects, laws_only=False), explored)
+            best = _without_idle(_revised(now, explored, laws_only=False), explored)
             if revisions > settings.revisions or best.labels == now.labels:
                 return best
         now = best
 
 
-def _revised(now: Fitted, explored: Explored, effects: Sequence[Effect], laws_only: bool) -> Fitted:
+def _revised(now: Fitted, explored: Explored, laws_only: bool) -> Fitted:
     """Replace each effect by another law of the same effect, or by any other effect, if the score rises."""
-    settings = explored.settings
+    settings, effects = explored.settings, explored.problem.library
     for label in now.labels:
-        own, rest = next(one for one in now.model.effects if one.label == label), explored.without(now, label)
-        if rest is None:
-            continue
-        laws = [one for one in effects if one.key == own.key]
-        found = candidates(rest, explored.data, laws if laws_only else effects)
-        least = 0.5 * settings.not_far_behind * max(c.reduction for c in found if c.effects[0][0].key == own.key)
-        for c in found[: settings.starts + len(laws)]:
-            if c.reduction < least:
-                break
-            one = explored.with_effects(rest, c.effects)
-            if one is not None and not at_an_edge(one) and explored.score(one) > explored.score(now) + settings.settled:
-                now = one
+        laws = [one for one in effects if one.key == now.model.effect(label).key]
+        tried = explored.in_place_of(now, label, laws if laws_only else effects, settings.starts + len(laws))
+        best = max((one for _, one in tried), key=explored.score, default=now)
+        if explored.score(best) > explored.score(now) + settings.settled:
+            now = best
     return now
 
 
@@ -221,23 +223,23 @@ def _without_idle(now: Fitted, explored: Explored) -> Fitted:
 
 def at_an_edge(fitted: Fitted) -> str:
     """Message on a parameter of an effect at the end of its range, or beyond what physics allows; empty if none is."""
-    for one in fitted.model.effects:
-        if one.implausible and (reason := one.implausible(fitted.model.of(one))):
+    for one, values in zip(fitted.model.effects, fitted.model.parts, strict=True):
+        if one.implausible and (reason := one.implausible(values)):
             return reason
-        for p, value in zip(one.parameters, fitted.model.of(one), strict=True):
+        for p, value in zip(one.parameters, values, strict=True):
             if value <= p.low or value >= p.high:
                 return f"{p.name} of {one.name} ends at {value:.3g} {p.unit}, the limit of its range"
     return ""
 
 
-def unnamed(now: Fitted, explored: Explored, effects: Sequence[Effect]) -> Fitted | None:
-    """The best model with an additional unnamed function; None if the data do not support one."""
-    settings, tried = explored.settings, []
-    others = [one for one in effects if one.outside]
-    for c in candidates(now, explored.data, others):
-        one = explored.with_effects(now, c.effects)
-        if one is not None:
-            tried.append(one)
+def unnamed(now: Fitted, explored: Explored, variable: str | None = None) -> Fitted | None:
+    """The best model with an additional unnamed function, of one variable if it is given; None if the data do not
+    support one."""
+    settings = explored.settings
+    others = [one for one in explored.problem.unnamed if variable in (None, one.variable)]
+    tried = [
+        one for c in explored.candidates(now, others) if (one := explored.with_effects(now, c.effects)) is not None
+    ]
     best = max(tried, key=lambda one: one.log_evidence, default=None)
     price = settings.certain + math.log(max(len(others), 1) * settings.outside_odds)
     return best if best is not None and best.log_evidence > now.log_evidence + price else None
@@ -253,25 +255,14 @@ class Rival:
     same: bool
 
 
-def rivals(best: Fitted, label: str, explored: Explored, effects: Sequence[Effect]) -> list[Rival]:
+def rivals(best: Fitted, label: str, explored: Explored) -> list[Rival]:
     """Effects that could replace a given one while all others are kept."""
-    settings = explored.settings
-    rest = explored.without(best, label)
-    if rest is None:
-        return []
-    own = next(one for one in best.model.effects if one.label == label)
-    found = candidates(rest, explored.data, [one for one in effects if not one.outside])
-    mine = next((c for c in found if c.effects[0][0].label == label), None)
-    least = 0.5 * mine.reduction if mine is not None else 0.0
-    known: list[Rival] = []
-    for c in found[: 2 * settings.refits]:
-        effect = c.effects[0][0]
-        if effect.key == own.key or c.reduction < settings.not_far_behind * least:
-            continue
-        one = explored.with_effects(rest, c.effects)
-        if one is None or at_an_edge(one):
-            continue
-        known.append(Rival(effect, one, explored.odds_against(best, one), alike(best, one, settings)))
+    settings, own = explored.settings, best.model.effect(label).key
+    known = [
+        Rival(effect, one, explored.odds_against(best, one), alike(best, one, settings))
+        for effect, one in explored.in_place_of(best, label, explored.problem.library, 2 * settings.refits)
+        if effect.key != own
+    ]
     return sorted(known, key=lambda r: -r.odds)
 
 
@@ -287,62 +278,43 @@ def cells(fitted: Fitted, held: bool, settings: AxisSettings) -> Cells:
     segment may have a larger variance than the fitted data, so that a single disturbance decides nothing."""
     data = fitted.model.lines.held if held else fitted.model.lines.fitted
     weights, e = unseen(fitted, data, settings) if held else (fitted.weights, fitted.e)
-    rows, determinant = row_table(fitted, data), np.zeros(len(e))
+    (frequency, segment, *_), determinant = row_table(fitted, data), np.zeros(len(e))
     for group, at in weights.rows.items():
         determinant[at] = weights.log_determinants[group] / len(at)
-    octave = 0 * rows.segment if held else np.floor(np.log2(rows.frequency)).astype(int)
-    places, cell = np.unique(np.stack([rows.segment, octave]), axis=1, return_inverse=True)
+    octave = 0 * segment if held else np.floor(np.log2(frequency))
+    places, cell = np.unique(np.stack([segment, octave]), axis=1, return_inverse=True)
     count, e2, rest = (np.bincount(cell.ravel(), x) for x in (np.ones(len(e)), e**2, determinant))
     louder = np.maximum(e2 / count, 1.0) if held else np.ones(len(e2))
     residual = e2 / louder + count * np.log(louder)
     return {(int(i), int(j), held): float(x) for i, j, x in zip(*places, -0.5 * (residual + rest), strict=True)}
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """Frequency [rad/s], segment, its start time [s], and level of each real number of the stacked residual."""
-
-    frequency: np.ndarray
-    segment: np.ndarray
-    when: np.ndarray
-    level: np.ndarray
-
-
-def row_table(fitted: Fitted, data: Data) -> Rows:
-    """Frequency, segment, time and level of the residual of a fit to these data."""
-    columns: list[list[np.ndarray]] = [[], [], [], []]
+def row_table(fitted: Fitted, data: Data) -> np.ndarray:
+    """(4, N) frequency [rad/s], segment, its start time [s], and level of each number of the residual of these data."""
+    parts = []
     for block, level in zip(data.blocks, data.levels, strict=True):
         segment, when = fitted.model.lines.of_lines(block.name)
-        for column, values in zip(columns, (block.omega, segment, when, np.full(len(when), level)), strict=True):
-            column.append(np.tile(np.repeat(values, block.Y.shape[1]), 2))
-    return Rows(*(np.concatenate(column) for column in columns))
+        lines = np.stack([block.omega, segment, when, np.full(len(when), level)])
+        parts.append(np.tile(np.repeat(lines, block.Y.shape[1], axis=1), 2))
+    return np.concatenate(parts, axis=1)
 
 
 def parts(fitted: Fitted, names: Sequence[str]) -> list[tuple[str, np.ndarray]]:
     """Halves of the data by band, time and level, each with half of the information on the given parameters."""
-    rows = row_table(fitted, fitted.model.lines.fitted)
+    frequency, _, when, level = row_table(fitted, fitted.model.lines.fitted)
     information = np.sum(fitted.J[[fitted.priors.names.index(name) for name in names]] ** 2, axis=0)
-    found = []
-    for values, words in (
-        (rows.frequency, ("the lower part of the band", "the upper part of the band")),
-        (rows.when, ("the first half of the record", "the second half of the record")),
-        (rows.level, ("low levels", "high levels")),
-    ):
-        order = np.argsort(values, kind="stable")
-        middle = values[order][np.searchsorted(np.cumsum(information[order]), information.sum() / 2)]
-        below = values <= middle
-        if below.any() and not below.all():
-            found += [(words[0], np.flatnonzero(below)), (words[1], np.flatnonzero(~below))]
-    return found
+    return [
+        *by_information(frequency, information, "the lower part of the band", "the upper part of the band"),
+        *by_information(when, information, "the first half of the record", "the second half of the record"),
+        *by_information(level, information, "low levels", "high levels"),
+    ]
 
 
 def robust(fitted: Fitted) -> np.ndarray:
     """Covariance of all parameter values, with the scores summed over each segment (K. Liang, S. Zeger, Biometrika 73
     (1986) 13), which allows any correlation within a segment. No variance is below that of the fit."""
-    segment, slope = row_table(fitted, fitted.model.lines.fitted).segment, fitted.priors.slopes(fitted.z)
-    groups = np.unique(segment)
-    scores = np.array(
-        [fitted.J[:, segment == one] @ fitted.e[segment == one] - fitted.z / len(groups) for one in groups]
-    )
-    P, few = fitted.covariance, len(groups) / max(len(groups) - 1, 1)
+    segment, slope = row_table(fitted, fitted.model.lines.fitted)[1], fitted.priors.slopes(fitted.z)
+    inside = np.unique(segment)[:, None] == segment
+    scores = (inside * fitted.e) @ fitted.J.T - fitted.z / len(inside)
+    P, few = fitted.covariance, len(inside) / max(len(inside) - 1, 1)
     return not_below(few * P @ (scores.T @ scores) @ P, P) * np.outer(slope, slope)

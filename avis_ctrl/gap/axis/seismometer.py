@@ -11,14 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.gap.axis.analysis import Problem
-from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Prediction, central_differences, split
+from avis_ctrl.gap.axis.model import AxisModel, Effect, Parameter, Problem
+from avis_ctrl.gap.axis.records import block_of
 from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.single_axis.identify import distinct, responses_of
@@ -57,36 +56,33 @@ class SensorModel(AxisModel):
 
     lines: Channels
 
-    def _predicted(self, pairs: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """(pairs, outputs)"""
-        c, base = self.lines, len(self.base)
+    def predicted(self, block: SpectralBlock) -> np.ndarray:
+        c, pairs = self.lines, self.lines.rows[block.name]
         rows = (2 * pairs[:, None] + np.arange(2)).ravel()
         s = 2j * np.pi * c.f[rows]
-        model = response(c.f[rows], tuple(name for name, _ in self.base), values[:base])
+        model = response(c.f[rows], tuple(p.name for p in self.base), self.values[: len(self.base)])
         H = [np.asarray(model[kind], complex) for kind in c.names]
-        for one, p in zip(self.effects, split(values, self.effects, base), strict=True):
+        for one, p in zip(self.effects, self.parts, strict=True):
             assert one.channel is not None
             H = [
                 h * one.channel(s, p) if one.location in (kind, "drive") else h
                 for kind, h in zip(c.names, H, strict=True)
             ]
-        found = np.log(np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1) / c.measured[rows])
+        found = np.log(_first_and_ratio(H) / c.measured[rows])
         parts = 1 + np.stack([found.real, found.imag], axis=2).reshape(len(rows), -1)
         return (parts[::2] + 1j * parts[1::2]) / c.spread[pairs][:, None]
+
+    def steps(self) -> np.ndarray:
+        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
+        return np.maximum(1e-5 * np.abs(self.values), least)
 
     def contributions(self, block: SpectralBlock) -> np.ndarray:
         return np.zeros((*block.Y.shape[:2], 1))  # an error that is constant over the band is a gain, which is free
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Prediction:
-        rows = self.lines.rows[block.name]
-        Y = self._predicted(rows, self.values)
-        if not derivative:
-            return Prediction(Y[:, :, None], np.empty((0, *Y.shape, 1)))
-        least = np.where(np.arange(len(self.values)) < len(self.base), 0.0, 1e-7 / float(self.lines.f[-1]))
-        dY = central_differences(
-            partial(self._predicted, rows), self.values, np.maximum(1e-5 * np.abs(self.values), least)
-        )
-        return Prediction(Y[:, :, None], np.array(dY)[..., None])
+
+def _first_and_ratio(H: Sequence[np.ndarray]) -> np.ndarray:
+    """(n, 1 or 2) the first channel, and the second over the first."""
+    return np.stack([H[0], *(one / H[0] for one in H[1:])], axis=1)
 
 
 def seismometer(
@@ -124,7 +120,7 @@ def seismometer(
     relative = {kind: np.asarray(responses.variance[kind]) / np.abs(responses.value[kind]) ** 2 for kind in names}
     both = sum(relative.values()) if ratio_variance is None else np.asarray(ratio_variance)
     n -= n % 2
-    measured = np.stack([H[0], *([H[1] / H[0]] if len(H) > 1 else [])], axis=1)[:n]
+    measured = _first_and_ratio(H)[:n]
     measured_noise, noise = (
         np.repeat(np.maximum(one[::2] + one[1::2], settings.floor**2), 2, axis=1)
         for one in (
@@ -142,15 +138,13 @@ def seismometer(
     inner = (pairs % 3 == 1) & (pairs < n // 2 - 1)  # the ends, where effects show most, are fitted
     for name, inside in (("fitted", ~inner), ("held out", inner)):
         at = rows[name] = pairs[inside]
-        Y = np.full(2 * len(names), 1 + 1j) / spread[at][:, None]
-        block = SpectralBlock(
-            name, 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1]), np.zeros((len(at), 0, 1)), Y[:, :, None]
-        )
-        data[name] = Data((block.with_noise(noise[at][:, :, None] * np.eye(2 * len(names))),), (1.0,))
+        Y, omega = np.full(2 * len(names), 1 + 1j) / spread[at][:, None], 2 * np.pi * np.sqrt(f[2 * at] * f[2 * at + 1])
+        data[name] = Data((block_of(name, omega, Y, noise[at]),), (1.0,))
     lines = Channels(f, measured, spread, names, data["fitted"], data["held out"], rows, settings)
-    units = dict(zip(start.names, start.information.units, strict=True))
-    model = SensorModel(lines, tuple(units.items()), (), np.asarray(start.values, float))
-    positive = tuple(name in ("corner_Hz", "damping") for name in start.names)
+    base = tuple(
+        Parameter(name, unit, linear=name not in ("corner_Hz", "damping"))
+        for name, unit in zip(start.names, start.information.units, strict=True)
+    )
     notes = (
         [f"The highest of the {len(f)} frequencies, {f[-1]:.4g} Hz, is not used: they are evaluated in pairs."]
         if n < len(f)
@@ -165,12 +159,11 @@ def seismometer(
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
     return Problem(
         "seismometer",
-        model,
-        positive,
+        SensorModel(lines, base, (), np.asarray(start.values, float)),
         sensor_effects(f, names),
         float(np.sum(measured_noise[rows["held out"]])) / power,
+        tuple(notes),
         {"F": "", "x": "", "input": "drive", "output": outputs},
-        notes=tuple(notes),
     )
 
 

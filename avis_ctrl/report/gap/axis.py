@@ -40,9 +40,7 @@ def _summary(gap: AxisGap) -> Section:
             {
                 "model": lambda one: wording.titled(one.name),
                 "error": lambda one: words.percent(one.nrmse),
-                "chi-square / dof": lambda one: (
-                    "not computed" if one.chi2_per_dof is None else words.number(one.chi2_per_dof, 4)
-                ),
+                "chi-square / dof": lambda one: words.number(one.chi2_per_dof, 4),
             },
         ),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1], height=0.7),
@@ -76,15 +74,15 @@ def _model(gap: AxisGap) -> Section:
 def _remaining(gap: AxisGap) -> Section:
     residual = Paragraph(
         f"The residual on held-out data is {words.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
-        f"its power beyond noise is {words.percent(gap.share_left)} of that of the base model."
+        f"its power beyond noise is {words.percent(gap.left.share)} of that of the base model."
     )
     where = listed(
         "Where most of the residual lies, as a fraction of its power.",
-        gap.where,
+        gap.remaining,
         {
-            "band": lambda one: f"{words.number(one['from_Hz'])} to {words.number(one['to_Hz'])} Hz",
-            "output": lambda one: str(one["output"]),
-            "fraction": lambda one: words.percent(one["share"]),
+            "band": lambda one: f"{words.number(one.from_Hz)} to {words.number(one.to_Hz)} Hz",
+            "output": lambda one: one.output,
+            "fraction": lambda one: words.percent(one.share),
         },
         "llr",
     )
