@@ -11,7 +11,18 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Faults, ModelComparison, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, Severity, quoted
+from avis_ctrl.measurement.gates.finding import (
+    Expectation,
+    Finding,
+    Limit,
+    Picture,
+    Response,
+    Series,
+    Severity,
+    bars,
+    quoted,
+    those,
+)
 from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
 
 ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
@@ -82,27 +93,19 @@ class ChannelMap(Gate):
         copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
         if comparison is None:
             if expectation.response is None:
-                return _not_compared(kept, copied, campaign, "no model was given", "ok")
-            return _not_compared(kept, copied, campaign, "too few driven samples", "note")
-        faults, least = explain(comparison), comparison.settings.least_agreement
-        order_picture = _order_picture(faults, campaign, comparison)
-        sign_picture = _sign_picture(faults, campaign, least)
-        order = copied + list(_exchanged(faults, campaign, least, order_picture))
-        signs = list(_flipped(faults, campaign, comparison, sign_picture))
-        return [
-            *(order or [_right(faults, campaign, comparison, order_picture)]),
-            *(signs or [_signs_agree(faults, least, sign_picture)]),
-        ]
+                return _not_compared(kept, copied, "no model was given", "ok")
+            return _not_compared(kept, copied, "too few driven samples", "note")
+        faults = explain(comparison)
+        picture = _order_picture(faults, campaign, comparison)
+        order = [*copied, *_exchanged(faults, campaign, comparison.settings.least_agreement, picture)]
+        order = order or [_right(faults, campaign, comparison, picture)]
+        return [*order, *_polarity(faults, campaign, comparison)]
 
 
-def _not_compared(
-    kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str, severity: Severity
-) -> list[Finding]:
-    none = Series("not known", np.arange(len(campaign.y_names)), np.zeros(len(campaign.y_names)), "points")
-    picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]", (none,))
+def _not_compared(kept: list[_Kept], copied: list[Finding], why: str, severity: Severity) -> list[Finding]:
     sentence = f"No channel is a copy of another; their order was not compared with a model ({why})."
     order = copied or [Finding(ORDER, severity, sentence, picture=_copy_picture(kept))]
-    return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).", picture=picture)]
+    return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).")]
 
 
 def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
@@ -159,7 +162,7 @@ def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison, pict
     worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
     lowest = float(faults.other[worst])
     least = f"the lowest correlation is {lowest:.2f}, of {campaign.y_names[worst]!r}"
-    alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
+    alone = those(campaign.y_names, faults.other < enough)
     severity: Severity = "ok"
     channels: tuple[str, ...] = ()
     if faults.doubtful:
@@ -197,8 +200,18 @@ def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparis
     )
 
 
-def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison, picture: Picture) -> Iterator[Finding]:
+def _polarity(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
+    """Flipped sensors and drives, or that there are none."""
+    least, lowest = comparison.settings.least_agreement, float(faults.other.min())
+    heights, limit = dict(zip(campaign.y_names, faults.r * faults.other, strict=True)), Limit("opposite sign", -least)
+    picture = bars("Signed correlation with the model", "sensor", "correlation [-]", heights, (limit,))
     rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
+    if faults.doubtful:
+        sentence = "The signs could not be checked: the agreement of model and records is too poor."
+        yield Finding(POLARITY, "note", sentence, value=lowest, limit=least, picture=picture)
+    elif not rows and not columns:
+        sentence = f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f})."
+        yield Finding(POLARITY, "ok", sentence, value=lowest, limit=least, picture=picture)
     either = 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving)
     doubt = " It is equally possible that all other channels are reversed." if either else ""
     said = []
@@ -216,30 +229,7 @@ def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison, pi
             "exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the sign of the "
             f"channel.{doubt}"
         )
-        limit = -comparison.settings.least_agreement
-        yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=limit, picture=picture)
-
-
-def _signs_agree(faults: Faults, least: float, picture: Picture) -> Finding:
-    lowest = float(faults.other.min())
-    severity: Severity = "note" if faults.doubtful else "ok"
-    sentence = (
-        "The signs could not be checked: the agreement of model and records is too poor."
-        if faults.doubtful
-        else f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f})."
-    )
-    return Finding(POLARITY, severity, sentence, value=lowest, limit=least, picture=picture)
-
-
-def _sign_picture(faults: Faults, campaign: Campaign, least: float) -> Picture:
-    return Picture(
-        "Signed correlation with the model",
-        "sensor",
-        "correlation [-]",
-        (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
-        (Limit("opposite sign", -least),),
-        x_names=campaign.y_names,
-    )
+        yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=-least, picture=picture)
 
 
 def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:

@@ -11,16 +11,7 @@ from scipy import stats
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-    samples_over_time,
-)
+from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Severity, bars, quoted, samples_over_time
 
 # The top code of a noise-free sine occurs up to 2.42 times as often as the next code.
 SINE_TOP = 2.42
@@ -111,14 +102,9 @@ class Clipping(Gate):
         peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
         top = max(peaks, key=lambda n: peaks[n])
         end = None if expectation.y_range_V is None else expectation.y_range_V[1]
-        picture = Picture(
-            "Largest absolute value of each channel",
-            "channel",
-            f"largest value [{campaign.y_unit}]",
-            (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),),
-            () if end is None else (Limit("converter", end),),
-            x_names=tuple(peaks),
-        )
+        limits = () if end is None else (Limit("converter", end),)
+        label = f"largest value [{campaign.y_unit}]"
+        picture = bars("Largest absolute value of each channel", "channel", label, peaks, limits)
         sentence = f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}."
         return found or [Finding(self.name, "ok", sentence, value=peaks[top], limit=end, picture=picture)]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, quoted, samples_over_time
@@ -32,14 +32,14 @@ SETTINGS = DeadSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """Data of one record; stuck : length and start of a stuck run, and t [s] and y around it, by channel."""
+    """Data of one record; stuck : finding on a stuck run, by channel."""
 
     record: str
     driven: bool
     rms: np.ndarray
     spread: np.ndarray
     codes: np.ndarray
-    stuck: dict[int, tuple[int, int, np.ndarray, np.ndarray]]
+    stuck: dict[int, Finding]
     response: np.ndarray | None
 
 
@@ -63,8 +63,7 @@ class DeadChannel(Gate):
             runs = equal_runs(y[:, k])
             (longest, at), second = runs[0], runs[1][0] if len(runs) > 1 else 1
             if max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second) <= longest < len(y):
-                part = slice(max(0, at - longest), at + 2 * longest)
-                stuck[k] = longest, at, t[part], y[part, k]
+                stuck[k] = self._stuck(seen.header, k, t, y[:, k], longest, at)
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         rms = np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0)
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
@@ -102,9 +101,7 @@ class DeadChannel(Gate):
                     "cable and input, or leave the channel out."
                 )
                 yield Finding(self.name, "stop", sentence, (name,), dead, 0.0, 0.0, picture)
-            for k in kept:
-                if j in k.stuck:
-                    yield self._stuck(name, j, k, campaign)
+            yield from (k.stuck[j] for k in kept if j in k.stuck)
             if not dead and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
                 sentence = (
                     f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s. "
@@ -125,15 +122,21 @@ class DeadChannel(Gate):
             )
             yield Finding(self.name, "note", sentence, idle, picture=picture)
 
-    def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
-        (n, at, t, x), rate = kept.stuck[j], campaign.sample_rate_Hz
+    def _stuck(self, header: RecordHeader, k: int, t: np.ndarray, x: np.ndarray, n: int, at: int) -> Finding:
+        """Finding on channel k with n equal samples from x[at] on."""
+        name, record, rate, part = (
+            header.y_names[k],
+            header.name,
+            header.sample_rate_Hz,
+            slice(max(0, at - n), at + 2 * n),
+        )
         limit = Limit("stuck from", at / rate, "x")
-        picture = samples_over_time(kept.record, name, t, x, campaign.y_unit, (limit,))
+        picture = samples_over_time(record, name, t[part], x[part], header.y_unit, (limit,))
         sentence = (
-            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) from "
+            f"Channel {name!r} of record {record} repeats one value for {n} samples ({n / rate:.3g} s) from "
             f"{at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or repeat the record."
         )
-        return Finding(self.name, "warning", sentence, (name,), (kept.record,), n, SETTINGS.stuck_samples, picture)
+        return Finding(self.name, "warning", sentence, (name,), (record,), n, SETTINGS.stuck_samples, picture)
 
 
 def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:

@@ -22,6 +22,7 @@ from avis_ctrl.measurement.gates.finding import (
     over_frequency,
     percent,
     quoted,
+    those,
 )
 from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, octaves, record_spectra, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
@@ -170,13 +171,12 @@ def _judged(
 ) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
-        picture = Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ())
-        return [Finding(gate, "ok", untested, picture=picture)]
+        return [Finding(gate, "ok", untested)]
     found = []
     for d in differences:
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
-            names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+            names = those(campaign.y_names, bad)
             severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
             sentence, records = described(d, bad, names)
             picture = _picture(d, campaign.y_names)

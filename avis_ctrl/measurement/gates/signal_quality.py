@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,8 @@ from avis_ctrl.measurement.gates.finding import (
     Finding,
     Limit,
     Picture,
-    Series,
     Severity,
+    bars,
     curves,
     over_frequency,
 )
@@ -86,8 +86,7 @@ class SignalToNoise(Gate):
         measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             sentence = "No driven record is long enough to separate signal and noise."
-            picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
-            return noisy or [Finding(self.name, "ok", sentence, picture=picture)]
+            return noisy or [Finding(self.name, "ok", sentence)]
         best = max(measured, key=lambda k: float(np.median(np.asarray(k.snr))))
         f, snr = best.f, np.asarray(best.snr)
         bands = octaves(f)
@@ -131,16 +130,10 @@ class SignalToNoise(Gate):
         if stated is None or not levels:
             return
         rms = np.median(levels, axis=0)
-        picture = Picture(
-            "Noise of each channel, from above half the Nyquist frequency",
-            "channel",
-            f"r.m.s. [{campaign.y_unit}]",
-            (Series("measured", np.arange(len(rms)), rms, "bars"),),
-            (Limit("stated", stated),),
-            y_scale="log",
-            x_names=campaign.y_names,
-        )
-        for name, one in zip(campaign.y_names, rms, strict=True):
+        heights, label = dict(zip(campaign.y_names, rms, strict=True)), f"r.m.s. [{campaign.y_unit}]"
+        title = "Noise of each channel, from above half the Nyquist frequency"
+        picture = bars(title, "channel", label, heights, (Limit("stated", stated),), "log")
+        for name, one in heights.items():
             if one > (limit := SETTINGS.noise_factor * stated):
                 sentence = (
                     f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., {one / stated:.1f} "
@@ -185,8 +178,7 @@ class Coherence(Gate):
         best, seconds = _pooled(chosen)
         if best is None:
             sentence = "No driven record is long enough for a coherence of all inputs together."
-            picture = Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ())
-            return [Finding(self.name, "ok", sentence, picture=picture)]
+            return [Finding(self.name, "ok", sentence)]
         free = best.unbiased_coherence()
         bands = thirds(best.f)
         middle = centres(best.f, bands)
@@ -194,7 +186,7 @@ class Coherence(Gate):
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
         z = stats.norm.isf(FINDING.false_alarm / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
-        surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
+        surely = np.flatnonzero(np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)).tolist()
         series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
         title = f"Multiple coherence at {top:.3g} V, third octaves"
         picture = over_frequency(title, "coherence [-]", series, (Limit("low", limit),), "linear")
@@ -204,13 +196,15 @@ class Coherence(Gate):
                 f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
                 "too short for a coherence of all inputs."
             )
-        low = np.any(mean < SETTINGS.low_coherence, axis=0)
-        groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
-        found = [
-            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-            for group in groups
-            if group
-        ]
+        low = np.flatnonzero(np.any(mean < SETTINGS.low_coherence, axis=0)).tolist()
+        causes = (
+            "Causes are noise, an input that is not recorded, nonlinearity, or, if the signal to noise is high, "
+            f"leakage of a mode that decays more slowly than the segments of {seconds:.3g} s. Longer records "
+            f"distinguish leakage from the other causes; a higher level reduces the influence of noise.{below}"
+        )
+        found = [self._low(campaign.y_names, [j], middle, mean, causes, picture) for j in surely]
+        if some := [j for j in low if j not in surely]:
+            found.append(self._low(campaign.y_names, some, middle, mean, causes, picture, "note"))
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         lowest = mean[b, j]
         sentence = (
@@ -222,15 +216,14 @@ class Coherence(Gate):
     def _low(
         self,
         names: tuple[str, ...],
-        group: list[int],
+        group: Sequence[int],
         middle: np.ndarray,
         mean: np.ndarray,
-        surely: bool,
-        seconds: float,
-        below: str,
+        causes: str,
         picture: Picture,
+        severity: Severity = "warning",
     ) -> Finding:
-        """Finding on one channel that is low everywhere, or on all channels that are low somewhere."""
+        """Finding on one channel that is low everywhere (a warning), or on all that are low somewhere (a note)."""
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
@@ -241,14 +234,10 @@ class Coherence(Gate):
                 f"{count} band{'s' * (count > 1)})"
             )
         more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
-        severity: Severity = "warning" if surely else "note"
-        part = "all" if surely else "some"
+        part = "all" if severity == "warning" else "some"
         sentence = (
             f"Multiple coherence is below {SETTINGS.low_coherence:g} in {part} of the {len(middle)} third-octave "
-            f"bands: {'; '.join(said)}{more}. Causes are noise, an input that is not recorded, nonlinearity, or, if "
-            "the signal to noise is high, leakage of a mode that decays more slowly than the segments of "
-            f"{seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher level reduces the "
-            f"influence of noise.{below}"
+            f"bands: {'; '.join(said)}{more}. {causes}"
         )
         channels, lowest = tuple(names[j] for j in ordered), mean[:, group].min()
         return Finding(self.name, severity, sentence, channels, (), lowest, SETTINGS.low_coherence, picture)
