@@ -17,7 +17,7 @@ from avis_ctrl.measurement.gates.channel_faults import MapSettings, compare, exp
 from avis_ctrl.measurement.gates.clipping import over_range, repeated_extreme
 from avis_ctrl.measurement.gates.dead_channel import equal_runs
 from avis_ctrl.measurement.gates.excerpt import excerpt
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, spectra
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, h1
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import delay_step, drifts, repeated_block
 from avis_ctrl.measurement.gates.periodicity import Periodicity, compared
@@ -138,7 +138,7 @@ def test_h1_of_white_noise_is_the_gain_with_its_stated_error(rng):
     G = np.array([[1.0, -2.0], [0.5, 0.0], [0.0, 3.0]])
     u = rng.standard_normal((40000, 2))
     y = u @ G.T + 0.1 * rng.standard_normal((40000, 3))
-    made = h1([spectra(u, y, 100.0, 256, wrap=False)])
+    made = h1([Samples(u, y, 100.0).spectra(256)])
     np.testing.assert_allclose(made.G.mean(axis=0).real, G, atol=0.005)
     variance = np.einsum("fi,fjj->fij", made.noise, made.covariance).real
     ratio = np.mean(np.abs(made.G - G) ** 2 / variance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -23,7 +23,7 @@ from avis_ctrl.measurement.gates.finding import (
     quoted,
     those,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, directions, segment_length, usable
 
 ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
 
@@ -47,15 +47,12 @@ COPIES = CopySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """u (samples, n_u), y and the model's y (samples, n_y) of a driven record; wrap: they are one period."""
+    """Copies in a record; of a driven one the samples, and the same with the model's y."""
 
     record: str
     copies: list[tuple[int, int, float, float]]
-    rate: float = 0.0
-    wrap: bool = False
-    u: np.ndarray | None = None
-    y: np.ndarray | None = None
-    model: np.ndarray | None = None
+    measured: Samples | None = None
+    model: Samples | None = None
 
 
 class ChannelMap(Gate):
@@ -78,11 +75,10 @@ class ChannelMap(Gate):
         copies = _copies(seen)
         if not seen.driven or expectation.response is None:
             return _Kept(seen.header.name, copies)
-        u, y, wrap = usable(seen)
-        rate = seen.header.sample_rate_Hz
-        model = predicted(expectation.response, u, rate, seen.header.u_names, wrap)
-        order = _order(seen.header.y_names, expectation.y_names, model.shape[1])
-        return _Kept(seen.header.name, copies, rate, wrap, u, y, None if order is None else model[:, order])
+        measured = usable(seen)
+        y = predicted(expectation.response, measured, seen.header.u_names)
+        order = _order(seen.header.y_names, expectation.y_names, y.shape[1])
+        return _Kept(seen.header.name, copies, measured, None if order is None else replace(measured, y=y[:, order]))
 
     def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         def response(f: np.ndarray) -> np.ndarray:
@@ -115,7 +111,8 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
         _, scale, rest = hits[0]
         if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
             continue
-        alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike for of in kept)
+        models = [of.model for of in kept]
+        alike = all(m is not None and _difference(m.y[:, i], m.y[:, k]) < COPIES.alike for m in models)
         severity: Severity = "note" if alike else "stop"
         cause = (
             "the model expects that of these records, so they do not show whether one signal was recorded twice. "
@@ -232,34 +229,35 @@ def _polarity(faults: Faults, campaign: Campaign, comparison: ModelComparison) -
         yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=-least, picture=picture)
 
 
-def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:
-    """(samples, n_y) y of the model, starting from rest; periodic if `wrap`."""
-    n = len(u) if wrap else 2 * len(u)
-    f = np.fft.rfftfreq(n, 1 / rate)
-    U = np.fft.rfft(u, n, axis=0)
+def predicted(response: Response, measured: Samples, inputs: tuple[str, ...]) -> np.ndarray:
+    """(samples, n_y) y of the model, starting from rest; periodic if the samples wrap."""
+    samples = len(measured.u)
+    n = samples if measured.wrap else 2 * samples
+    f = np.fft.rfftfreq(n, 1 / measured.rate_Hz)
+    U = np.fft.rfft(measured.u, n, axis=0)
     # The model's response is not needed on lines 60 dB below the largest.
     power = np.sum(np.abs(U) ** 2, axis=1)
     keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
     if not keep.any():
-        return np.zeros((len(u), 0))
+        return np.zeros((samples, 0))
     G = response(2 * np.pi * f[keep], inputs)
     Y = np.zeros((len(f), G.shape[1]), complex)
     Y[keep] = np.einsum("fij,fj->fi", G, U[keep])
-    return np.fft.irfft(Y, n, axis=0)[: len(u)]
+    return np.fft.irfft(Y, n, axis=0)[:samples]
 
 
 def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
     """Measured and expected spectra, with the longest segments that all records together allow: records that drive one
     axis after the other are short, but many.
     """
-    held = [(k, k.u, k.y, k.model) for k in kept if k.u is not None and k.y is not None and k.model is not None]
+    held = [(k.measured, k.model) for k in kept if k.measured is not None and k.model is not None]
     if not held:
         return []
-    rank = directions(np.concatenate([u - u.mean(axis=0) for _, u, _, _ in held])).shape[1]
-    shortest, samples = min(len(u) for _, u, _, _ in held), sum(len(u) for _, u, _, _ in held)
-    length = min(segment_length(samples, rank), 1 << int(np.log2(max(16, shortest))))
-    return [(spectra(u, y, k.rate, length, k.wrap), spectra(u, m, k.rate, length, k.wrap)) for k, u, y, m in held]
+    rank = directions(np.concatenate([one.u - one.u.mean(axis=0) for one, _ in held])).shape[1]
+    samples = [len(one.u) for one, _ in held]
+    length = min(segment_length(sum(samples), rank), 1 << int(np.log2(max(16, min(samples)))))
+    return [(one.spectra(length), model.spectra(length)) for one, model in held]
 
 
 def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) -> list[int] | None:

@@ -12,7 +12,7 @@ from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, quoted, samples_over_time
-from avis_ctrl.measurement.gates.h1 import h1, moving, record_spectra, usable
+from avis_ctrl.measurement.gates.h1 import h1, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 
@@ -153,8 +153,8 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
-    u, y, wrap = usable(seen)
-    if not moving(u) or (estimate := h1([record_spectra(u, y, wrap, seen.header.sample_rate_Hz)])) is None:
+    samples = usable(seen)
+    if not samples.moving or (estimate := h1([samples.spectra()])) is None:
         return None
     limit = stats.beta.isf(FINDING.false_alarm / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)

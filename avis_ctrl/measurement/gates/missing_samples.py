@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +13,7 @@ from avis_ctrl.measurement.campaign import Campaign, RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, moving, segment_length, spectra
+from avis_ctrl.measurement.gates.h1 import H1, Samples, Spectra, h1
 
 
 @dataclass(frozen=True)
@@ -166,21 +166,19 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
     rate = seen.header.sample_rate_Hz
-    u, y, length = _beginning(seen)
-    of = spectra(u, y, rate, length, wrap=False)
+    of = _beginning(seen).spectra()
     half = len(of.U) // 2
     parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
     estimates = [e for part in parts if (e := h1([part])) is not None]
     if not estimates:
         return np.zeros(0), np.zeros((1, 0))
-    t = seen.first.header.start_s + (np.arange(len(of.U)) * (length // 2) + length / 2) / rate
+    # A segment lasts 1 / of.f[1] seconds; the next one starts after half of it.
+    t = seen.first.header.start_s + (np.arange(len(of.U)) + 1) / (2 * of.f[1])
     return t, np.array([_delay(of, estimate, rate) for estimate in estimates])
 
 
-def _beginning(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, int]:
-    """u and y of the beginning of the record, and the length of its segments."""
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    return u, y, segment_length(len(u), moving(seen.first.u))
+def _beginning(seen: Excerpt) -> Samples:
+    return Samples(seen.first.u[: 1 << 17], seen.first.y[: 1 << 17], seen.header.sample_rate_Hz)
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
@@ -209,8 +207,8 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     result is -inf.
     """
     rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
-    u, y, length = _beginning(seen)
-    of = spectra(u, y, rate, length, wrap=False)
+    samples = _beginning(seen)
+    y, of = samples.y, samples.spectra()
     before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
     first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
     showing = of.f[np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second)]
@@ -221,7 +219,7 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
             whole = np.concatenate([y[:at], np.repeat(y[at : at + 1], count, axis=0), y[at:]])[: len(y)]
         else:
             whole = np.concatenate([y[:at], y[at + count :], np.repeat(y[-1:], count, axis=0)])
-        after = h1([spectra(u, whole, rate, length, wrap=False)])
+        after = h1([replace(samples, y=whole).spectra()])
         if before is not None and after is not None:
             f = np.intersect1d(showing, np.intersect1d(before.f, after.f))
             if f.size > SETTINGS.showing * before.f.size:

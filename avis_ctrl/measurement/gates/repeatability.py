@@ -24,7 +24,7 @@ from avis_ctrl.measurement.gates.finding import (
     quoted,
     those,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, octaves, record_spectra, usable
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, driven_lines, h1, octaves, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -56,25 +56,18 @@ LEVEL_DEPENDENCE = "level dependence"  # gate name of the findings on different 
 
 
 @dataclass(frozen=True, eq=False)
-class _Mean:
-    """Mean of the periods after the first, u and y (samples, channels), with the variance of its windowed lines."""
-
-    u: np.ndarray
-    y: np.ndarray
-    variance: np.ndarray
-    dof: int
-
-
-@dataclass(frozen=True, eq=False)
 class _Kept:
-    """Data of one record; mean : for periodic records only."""
+    """Data of one record; of periodic records also the mean period, with the variance (lines, n_y) of its windowed
+    lines and the degrees of freedom of this variance.
+    """
 
     record: str
     kind: str
     level: float
-    rate: float
     of: Spectra
-    mean: _Mean | None = None
+    mean: Samples | None = None
+    variance: np.ndarray | None = None
+    dof: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,14 +107,12 @@ class Comparison(Gate):
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
-        u, y, wrap = usable(seen)
-        of = record_spectra(u, y, wrap, h.sample_rate_Hz)
-        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
-        if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
+        mean = usable(seen)
+        kept = _Kept(h.name, h.excitation, h.level_V, mean.spectra())
+        if not mean.wrap or (P := len(periods := seen.periods("y")[1:])) < 3:
             return kept
-        P = len(periods)
-        variance = smoothed(np.sum(np.abs(windowed(periods - y)) ** 2, axis=0) / (P - 1)) / P
-        return replace(kept, mean=_Mean(u, y, variance, P - 1))
+        variance = smoothed(np.sum(np.abs(windowed(periods - mean.y)) ** 2, axis=0) / (P - 1)) / P
+        return replace(kept, mean=mean, variance=variance, dof=P - 1)
 
     def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
         groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
@@ -240,21 +231,21 @@ def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | Non
 def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
     """If u of b is a multiple of u of a: y of b compared with the same multiple of y of a; otherwise None."""
     first, second = a.mean, b.mean
-    if first is None or second is None or first.u.shape != second.u.shape:
+    if first is None or second is None or a.variance is None or b.variance is None or first.u.shape != second.u.shape:
         return None
     power = float(np.sum(first.u * first.u))
     scale = float(np.sum(first.u * second.u)) / power if power else 0.0
     if scale <= 0 or np.max(np.abs(second.u - scale * first.u)) > 1e-3 * np.max(np.abs(second.u)):
         return None
     D = windowed(second.y - scale * first.y)
-    variance = np.maximum(second.variance + scale**2 * first.variance, 1e-300)
+    variance = np.maximum(b.variance + scale**2 * a.variance, 1e-300)
     size = np.abs(windowed(second.y - second.y.mean(axis=0))) ** 2
-    f = np.fft.rfftfreq(len(first.y), 1 / a.rate)[2:-1:2]
+    f = np.fft.rfftfreq(len(first.y), 1 / first.rate_Hz)[2:-1:2]
     driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
     keep = driven_lines(driven)
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     f, power, variance, size = f[keep], np.abs(D[keep]) ** 2, variance[keep], size[keep]
-    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(first.dof, second.dof), level)
+    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(a.dof, b.dof), level)
 
 
 def _in_octaves(

@@ -21,17 +21,7 @@ from avis_ctrl.measurement.gates.finding import (
     curves,
     over_frequency,
 )
-from avis_ctrl.measurement.gates.h1 import (
-    H1,
-    centres,
-    driven_lines,
-    h1,
-    octaves,
-    record_spectra,
-    spectra,
-    thirds,
-    usable,
-)
+from avis_ctrl.measurement.gates.h1 import H1, Samples, centres, driven_lines, h1, octaves, thirds, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
 
@@ -142,17 +132,6 @@ class SignalToNoise(Gate):
                 yield Finding(self.name, "warning", sentence, (name,), (), one, limit, picture)
 
 
-@dataclass(frozen=True, eq=False)
-class _Coherence:
-    """u (samples, n_u), y (samples, n_y) of a driven record; wrap: they are one period."""
-
-    level: float
-    rate: float
-    u: np.ndarray
-    y: np.ndarray
-    wrap: bool
-
-
 class Coherence(Gate):
     """Multiple coherence of each channel with all inputs, over the driven records near the largest level.
 
@@ -166,15 +145,18 @@ class Coherence(Gate):
 
     name = "coherence"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Coherence | None:
+    def look(self, seen: Excerpt, expectation: Expectation) -> tuple[float, Samples] | None:
+        """Level and samples of a driven record."""
         if not seen.driven or seen.header.excitation == "sine":
             return None
-        return _Coherence(seen.header.level_V, seen.header.sample_rate_Hz, *usable(seen))
+        return seen.header.level_V, usable(seen)
 
-    def conclude(self, kept: list[_Coherence | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(
+        self, kept: list[tuple[float, Samples] | None], campaign: Campaign, expectation: Expectation
+    ) -> list[Finding]:
         driven = [k for k in kept if k is not None]
-        top = max((k.level for k in driven), default=0.0)
-        chosen = [k for k in driven if k.level * SETTINGS.same_level >= top]
+        top = max((level for level, _ in driven), default=0.0)
+        chosen = [samples for level, samples in driven if level * SETTINGS.same_level >= top]
         best, seconds = _pooled(chosen)
         if best is None:
             sentence = "No driven record is long enough for a coherence of all inputs together."
@@ -243,7 +225,7 @@ class Coherence(Gate):
         return Finding(self.name, severity, sentence, channels, (), lowest, SETTINGS.low_coherence, picture)
 
 
-def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
+def _pooled(chosen: list[Samples]) -> tuple[H1 | None, float]:
     """H1 over records, with the longest segments that are numerous enough, and their length in s."""
     if not chosen:
         return None, 0.0
@@ -251,21 +233,20 @@ def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
     shortest, samples = min(len(k.u) for k in chosen), sum(len(k.u) for k in chosen)
     length = 1 << int(np.log2(max(16, shortest)))
     # The longest segments that are numerous enough: twice the number of inputs plus 8.
-    rate = chosen[0].rate
     while length >= 16:
         enough = 2 * samples / length >= 2 * n_u + 8
-        if enough and (made := h1([spectra(k.u, k.y, rate, length, k.wrap) for k in chosen])) is not None:
-            return made, length / rate
+        if enough and (made := h1([k.spectra(length) for k in chosen])) is not None:
+            return made, length / chosen[0].rate_Hz
         length //= 2
     return None, 0.0
 
 
-def _lowest_driven(chosen: list[_Coherence]) -> float:
+def _lowest_driven(chosen: list[Samples]) -> float:
     """Lowest frequency [Hz] of the whole records at which the voltages have a thousandth of their largest power."""
     lowest = []
     for k in chosen:
         power = np.sum(np.abs(np.fft.rfft(k.u - k.u.mean(axis=0), axis=0)) ** 2, axis=1)
-        lowest.append(float(np.flatnonzero(driven_lines(power))[0]) * k.rate / len(k.u))
+        lowest.append(float(np.flatnonzero(driven_lines(power))[0]) * k.rate_Hz / len(k.u))
     return min(lowest)
 
 
@@ -287,7 +268,7 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
-    of = record_spectra(*usable(seen), rate)
+    of = usable(seen).spectra()
     if (estimate := h1([of])) is None:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.unbiased_coherence(), 0.0)
