@@ -251,9 +251,9 @@ def test_a_response_that_grows_has_not_settled(clean):
 
 
 def channel_alarms(campaign, expectation):
-    gate = ChannelMap()
-    kept = [gate.look(excerpt(r), expectation) for r in campaign.records]
-    return [f for f in gate.conclude(kept, campaign, expectation) if f.severity in SEVERE]
+    gate = ChannelMap(campaign, expectation)
+    kept = [gate.look(excerpt(r)) for r in campaign.records]
+    return [f for f in gate.conclude(kept) if f.severity in SEVERE]
 
 
 def told_chance(finding):
@@ -356,8 +356,8 @@ def test_a_swept_sine_lacks_no_samples():
     rng, t = np.random.default_rng(9), np.arange(8000) / RATE
     u = 0.1 * np.outer(np.sin(2 * np.pi * (1 * t + 59 / 16 * t**2)), np.eye(8)[1])
     whole = record("00", u, measured(rng, u), "noise", 0.07, 0.0)
-    gate = MissingSamples()
-    (said,) = gate.conclude([gate.look(excerpt(whole), known())], Campaign("avis", (whole,)), known())
+    gate = MissingSamples(Campaign("avis", (whole,)), known())
+    (said,) = gate.conclude([gate.look(excerpt(whole))])
     assert said.severity == "ok", said.sentence
 
 

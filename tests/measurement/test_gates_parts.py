@@ -205,8 +205,8 @@ def test_false_alarms_of_hum(colour):
     hits = 0
     for seed in range(100):
         record = rest(np.random.default_rng(seed), colour=colour)
-        gate = Hum()
-        found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+        gate = Hum(Campaign("x", (record,)), Expectation())
+        found = gate.conclude([gate.look(excerpt(record))])
         hits += any(f.severity != "ok" for f in found)
     assert hits <= 4
 
@@ -219,8 +219,8 @@ def test_hum_names_mains_channel_and_size(rng, mains, off):
     y = record.y.copy()
     y[:, 2] += 0.4 * np.sin(2 * np.pi * (mains * off) * np.arange(len(y)) / 1000)
     record = Record(record.header, record.u, y)
-    gate = Hum()
-    found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+    gate = Hum(Campaign("x", (record,)), Expectation())
+    found = gate.conclude([gate.look(excerpt(record))])
     assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
     assert f"carries mains hum at {mains:g} Hz:" in found[0].sentence
     said = re.search(r"Hz: at (\S+) Hz (\S+) V r\.m\.s\.", found[0].sentence)
@@ -269,7 +269,7 @@ def test_a_channel_that_differs_only_before_the_reference_has_settled():
     header = RecordHeader("00", 100.0, 600, ("u",), ("a", "b"), "multisine", 1.0, 0.0, 1.0)
     campaign = Campaign("x", (Record(header, np.zeros((600, 1)), np.zeros((600, 2))),))
     periods = periodicity._Kept("00", 1.0, T, 0.1 * T, 50, 2)
-    (finding,) = Periodicity().conclude([periods], campaign, Expectation())
+    (finding,) = Periodicity(campaign, Expectation()).conclude([periods])
     assert finding.severity == "warning" and finding.channels == ("a",)
 
 

@@ -11,18 +11,7 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Faults, ModelComparison, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Response,
-    Series,
-    Severity,
-    bars,
-    quoted,
-    those,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Response, Series, Severity, bars, quoted, those
 from avis_ctrl.measurement.gates.h1 import Samples, Spectra, directions, segment_length, usable
 
 ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
@@ -71,31 +60,31 @@ class ChannelMap(Gate):
 
     name = "channel map"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         copies = _copies(seen)
-        if not seen.driven or expectation.response is None:
+        if not seen.driven or self.expectation.response is None:
             return _Kept(seen.header.name, copies)
         measured = usable(seen)
-        y = predicted(expectation.response, measured, seen.header.u_names)
-        order = _order(seen.header.y_names, expectation.y_names, y.shape[1])
+        y = predicted(self.expectation.response, measured, seen.header.u_names)
+        order = _order(seen.header.y_names, self.expectation.y_names, y.shape[1])
         return _Kept(seen.header.name, copies, measured, None if order is None else replace(measured, y=y[:, order]))
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         def response(f: np.ndarray) -> np.ndarray:
-            assert expectation.response is not None
-            G = expectation.response(2 * np.pi * f, campaign.u_names)
-            return G[:, _order(campaign.y_names, expectation.y_names, G.shape[1])]
+            assert self.expectation.response is not None
+            G = self.expectation.response(2 * np.pi * f, self.campaign.u_names)
+            return G[:, _order(self.campaign.y_names, self.expectation.y_names, G.shape[1])]
 
-        copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
+        copied, comparison = list(_copied(kept, self.campaign)), compare(_pairs(kept), response)
         if comparison is None:
-            if expectation.response is None:
+            if self.expectation.response is None:
                 return _not_compared(kept, copied, "no model was given", "ok")
             return _not_compared(kept, copied, "too few driven samples", "note")
         faults = explain(comparison)
-        picture = _order_picture(faults, campaign, comparison)
-        order = [*copied, *_exchanged(faults, campaign, comparison.settings.least_agreement, picture)]
-        order = order or [_right(faults, campaign, comparison, picture)]
-        return [*order, *_polarity(faults, campaign, comparison)]
+        picture = _order_picture(faults, self.campaign, comparison)
+        order = [*copied, *_exchanged(faults, self.campaign, comparison.settings.least_agreement, picture)]
+        order = order or [_right(faults, self.campaign, comparison, picture)]
+        return [*order, *_polarity(faults, self.campaign, comparison)]
 
 
 def _not_compared(kept: list[_Kept], copied: list[Finding], why: str, severity: Severity) -> list[Finding]:

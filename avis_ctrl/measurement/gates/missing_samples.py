@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.measurement.gates.h1 import H1, Samples, Spectra, h1
 
 
@@ -72,7 +72,7 @@ class MissingSamples(Gate):
 
     name = "missing samples"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         t, delay = delays(seen)
         stepped = [
             one
@@ -91,7 +91,7 @@ class MissingSamples(Gate):
         )
         return _Kept(seen.header, list(self._rows(seen, picture)), t, delay, picture, stepped)
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         level = FINDING.false_alarm / max(1, sum(k.delay.size for k in kept))
         found = [*self._overlaps(kept), *(f for k in kept for f in (*k.found, *self._steps(k, level)))]
         longest = max(kept, key=lambda k: len(k.t))

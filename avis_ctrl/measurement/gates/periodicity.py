@@ -7,20 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    curves,
-    percent,
-    quoted,
-    those,
-    times,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, curves, percent, quoted, those, times
 
 
 @dataclass(frozen=True)
@@ -62,14 +51,14 @@ class Periodicity(Gate):
 
     name = "periodicity"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+    def look(self, seen: Excerpt) -> _Kept | None:
         if not seen.periodic or not seen.driven or len(y := seen.periods("y")) < 4:
             return None
         T, relative, lines, R = compared(y)
         drift = trend(y[len(y) - R :]) if R > 2 else None
         return _Kept(seen.header.name, seen.header.period_s or 0.0, T, relative, lines, R - 1, drift)
 
-    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept | None]) -> list[Finding]:
         judged = [k for k in kept if k is not None]
         if not judged:
             sentence = "Periodicity was not tested: no record is periodic with four periods or more."
@@ -83,13 +72,13 @@ class Periodicity(Gate):
                 f"Record {k.record}: periods against the last {len(k.T) // 2}",
                 "period",
                 "difference by noise, power [-]",
-                curves(campaign.y_names, np.arange(1, len(k.T) + 1), k.T, "points"),
+                curves(self.campaign.y_names, np.arange(1, len(k.T) + 1), k.T, "points"),
                 (Limit("1 % limit for noise", limit),),
                 y_scale="log",
             )
             failed = np.flatnonzero((limit < k.T).any(axis=1))
             drop = int(failed[-1]) + 1 if len(failed) else 0
-            if warned := self._unsteady(k, drop, limit, level, campaign, picture):
+            if warned := self._unsteady(k, drop, limit, level, picture):
                 found.append(warned)
             else:
                 drops.append((drop, k, limit, picture))
@@ -112,25 +101,26 @@ class Periodicity(Gate):
         )
         return found or [Finding(self.name, "ok", sentence, value=largest, limit=limit, picture=picture)]
 
-    def _unsteady(
-        self, k: _Kept, drop: int, limit: float, level: float, campaign: Campaign, picture: Picture
-    ) -> Finding | None:
+    def _unsteady(self, k: _Kept, drop: int, limit: float, level: float, picture: Picture) -> Finding | None:
         """Finding if the periods of the reference change steadily, or differ."""
         P = len(k.T)
-        bad: np.ndarray = np.zeros(len(campaign.y_names), bool)
+        bad: np.ndarray = np.zeros(len(self.campaign.y_names), bool)
         if k.drift is not None:
             T, drift = k.drift
             of_drift = float(stats.f.isf(level, k.lines, k.lines * (k.dof - 1)))
             bad = (of_drift < T) & (drift > SETTINGS.drift)
         if bad.any():
-            names, largest, limit = those(campaign.y_names, bad), T[bad].max(), of_drift
+            names, largest, limit = those(self.campaign.y_names, bad), T[bad].max(), of_drift
             said = (
                 f"drifts: over its last {P // 2} periods of {k.period_s:g} s {quoted(names)} change steadily by "
                 f"{percent(drift[bad].max())} of the signal ({times(float(largest))} the noise power; limit for noise "
                 f"alone {limit:.2f})"
             )
         elif drop > P - P // 2:
-            names, largest = those(campaign.y_names, np.any(k.T[P - P // 2 :] > limit, axis=0)), k.T[drop - 1].max()
+            names, largest = (
+                those(self.campaign.y_names, np.any(k.T[P - P // 2 :] > limit, axis=0)),
+                k.T[drop - 1].max(),
+            )
             said = (
                 f"has not settled after {drop} of {P} periods of {k.period_s:g} s: {quoted(names)} still differ by "
                 f"{times(float(np.sqrt(largest)))} the noise, {percent(k.relative[drop - 1].max())} of the signal"

@@ -13,7 +13,6 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import (
-    Expectation,
     Finding,
     Limit,
     Picture,
@@ -103,7 +102,7 @@ class Comparison(Gate):
 
     name = "repeatability"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+    def look(self, seen: Excerpt) -> _Kept | None:
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
@@ -114,8 +113,8 @@ class Comparison(Gate):
         variance = smoothed(np.sum(np.abs(windowed(periods - mean.y)) ** 2, axis=0) / (P - 1)) / P
         return replace(kept, mean=mean, variance=variance, dof=P - 1)
 
-    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
+    def conclude(self, kept: list[_Kept | None]) -> list[Finding]:
+        groups, n_y = _by_kind_and_level(kept), len(self.campaign.y_names)
         pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
         level = FINDING.false_alarm / max(1, len(pairs) * n_y)
         repeats = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
@@ -124,13 +123,13 @@ class Comparison(Gate):
         levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         untested = "Repeatability was not tested: no two driven records of one level and enough length."
-        found = _judged(self.name, repeats, campaign, _drifted, agreed, untested)
+        found = _judged(self.name, repeats, self.campaign, _drifted, agreed, untested)
         untested = (
             "Dependence on the level was not tested: no driven records of one kind and enough length at two levels, at "
             f"least a factor {SETTINGS.apart:g} apart."
         )
         agreed = "The responses at all levels agree"
-        return found + _judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, agreed, untested)
+        return found + _judged(LEVEL_DEPENDENCE, levels, self.campaign, _nonlinear, agreed, untested)
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:

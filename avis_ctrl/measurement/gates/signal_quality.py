@@ -8,19 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Severity,
-    bars,
-    curves,
-    over_frequency,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Severity, bars, curves, over_frequency
 from avis_ctrl.measurement.gates.h1 import H1, Samples, centres, driven_lines, h1, octaves, thirds, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
@@ -67,12 +57,12 @@ class SignalToNoise(Gate):
 
     name = "signal to noise"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Noise:
-        noise = _high_noise(seen) if expectation.sensor_noise_rms_V else None
+    def look(self, seen: Excerpt) -> _Noise:
+        noise = _high_noise(seen) if self.expectation.sensor_noise_rms_V else None
         return _Noise(*_snr(seen), noise)
 
-    def conclude(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        noisy = list(self._noisy(kept, campaign, expectation))
+    def conclude(self, kept: list[_Noise]) -> list[Finding]:
+        noisy = list(self._noisy(kept))
         measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             sentence = "No driven record is long enough to separate signal and noise."
@@ -82,12 +72,12 @@ class SignalToNoise(Gate):
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = centres(f, bands)
-        series, low = curves(campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
+        series, low = curves(self.campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
         picture = over_frequency("Signal to noise of the best record", "ratio [dB]", series, (low,), "linear")
-        found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
+        found = noisy + list(self._weak(self.campaign.y_names, middle, dB, best.segment_s, picture))
         b, j = divmod(int(np.argmin(dB)), dB.shape[1])
         sentence = (
-            f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} around "
+            f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {self.campaign.y_names[j]!r} around "
             f"{middle[b]:.3g} Hz)."
         )
         return found or [Finding(self.name, "ok", sentence, value=dB[b, j], limit=SETTINGS.low_dB, picture=picture)]
@@ -114,19 +104,19 @@ class SignalToNoise(Gate):
                 sentence = f"Channel {name!r} has little signal: {low}{advice}"
                 yield Finding(self.name, "note", sentence, (name,), (), levels.min(), SETTINGS.low_dB, picture)
 
-    def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
-        stated = expectation.sensor_noise_rms_V
+    def _noisy(self, kept: list[_Noise]) -> Iterator[Finding]:
+        stated = self.expectation.sensor_noise_rms_V
         levels = [k.noise_rms for k in kept if k.noise_rms is not None]
         if stated is None or not levels:
             return
         rms = np.median(levels, axis=0)
-        heights, label = dict(zip(campaign.y_names, rms, strict=True)), f"r.m.s. [{campaign.y_unit}]"
+        heights, label = dict(zip(self.campaign.y_names, rms, strict=True)), f"r.m.s. [{self.campaign.y_unit}]"
         title = "Noise of each channel, from above half the Nyquist frequency"
         picture = bars(title, "channel", label, heights, (Limit("stated", stated),), "log")
         for name, one in heights.items():
             if one > (limit := SETTINGS.noise_factor * stated):
                 sentence = (
-                    f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., {one / stated:.1f} "
+                    f"Channel {name!r} has sensor noise of {one:.3g} {self.campaign.y_unit} r.m.s., {one / stated:.1f} "
                     "times what the rig file states. Check its preamplifier and cable, or correct the rig file."
                 )
                 yield Finding(self.name, "warning", sentence, (name,), (), one, limit, picture)
@@ -145,15 +135,13 @@ class Coherence(Gate):
 
     name = "coherence"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> tuple[float, Samples] | None:
+    def look(self, seen: Excerpt) -> tuple[float, Samples] | None:
         """Level and samples of a driven record."""
         if not seen.driven or seen.header.excitation == "sine":
             return None
         return seen.header.level_V, usable(seen)
 
-    def conclude(
-        self, kept: list[tuple[float, Samples] | None], campaign: Campaign, expectation: Expectation
-    ) -> list[Finding]:
+    def conclude(self, kept: list[tuple[float, Samples] | None]) -> list[Finding]:
         driven = [k for k in kept if k is not None]
         top = max((level for level, _ in driven), default=0.0)
         chosen = [samples for level, samples in driven if level * SETTINGS.same_level >= top]
@@ -169,7 +157,7 @@ class Coherence(Gate):
         z = stats.norm.isf(FINDING.false_alarm / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
         surely = np.flatnonzero(np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)).tolist()
-        series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
+        series, limit = curves(self.campaign.y_names, middle, mean), SETTINGS.low_coherence
         title = f"Multiple coherence at {top:.3g} V, third octaves"
         picture = over_frequency(title, "coherence [-]", series, (Limit("low", limit),), "linear")
         below, excited = "", _lowest_driven(chosen)
@@ -184,14 +172,14 @@ class Coherence(Gate):
             f"leakage of a mode that decays more slowly than the segments of {seconds:.3g} s. Longer records "
             f"distinguish leakage from the other causes; a higher level reduces the influence of noise.{below}"
         )
-        found = [self._low(campaign.y_names, [j], middle, mean, causes, picture) for j in surely]
+        found = [self._low(self.campaign.y_names, [j], middle, mean, causes, picture) for j in surely]
         if some := [j for j in low if j not in surely]:
-            found.append(self._low(campaign.y_names, some, middle, mean, causes, picture, "note"))
+            found.append(self._low(self.campaign.y_names, some, middle, mean, causes, picture, "note"))
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         lowest = mean[b, j]
         sentence = (
             f"Multiple coherence is at least {lowest:.2f} in every third-octave band from {best.f[0]:.3g} to "
-            f"{best.f[-1]:.3g} Hz (lowest {campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"
+            f"{best.f[-1]:.3g} Hz (lowest {self.campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"
         )
         return found or [Finding(self.name, "ok", sentence, value=lowest, limit=limit, picture=picture)]
 

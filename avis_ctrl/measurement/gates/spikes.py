@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, bars, samples_over_time, times
+from avis_ctrl.measurement.gates.finding import Finding, Limit, bars, samples_over_time, times
 
 # Departure from the cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6. These are
 # also the five departures around a spike of height 1.
@@ -47,30 +47,28 @@ class Spikes(Gate):
 
     name = "spikes"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> tuple[list[Finding], float]:
+    def look(self, seen: Excerpt) -> tuple[list[Finding], float]:
         """Findings on the record, and the largest median departure."""
         found, least = [], 0.0
         for piece in seen.pieces:
             t = piece.time - seen.header.start_s
             for name, x in zip(seen.header.y_names, piece.y.T, strict=True):
-                where, ratio, spread = spikes(x, expectation.y_lsb_V)
+                where, ratio, spread = spikes(x, self.expectation.y_lsb_V)
                 least = max(least, float(np.max(spread, initial=0.0)))
                 if len(where):
                     found.append(self._finding(seen.header, name, t, x, where, ratio))
         return found, least
 
-    def conclude(
-        self, kept: list[tuple[list[Finding], float]], campaign: Campaign, expectation: Expectation
-    ) -> list[Finding]:
+    def conclude(self, kept: list[tuple[list[Finding], float]]) -> list[Finding]:
         if found := [finding for of, _ in kept for finding in of]:
             return found
         least = np.array([SETTINGS.factor * one for _, one in kept])
         sentence = (
-            f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} {campaign.y_unit} "
-            "would be found in every record."
+            f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
+            f"{self.campaign.y_unit} would be found in every record."
         )
-        heights = dict(zip((r.header.name for r in campaign.records), least, strict=True))
-        picture = bars("Smallest spike that would be found", "record", f"spike [{campaign.y_unit}]", heights)
+        heights = dict(zip((r.header.name for r in self.campaign.records), least, strict=True))
+        picture = bars("Smallest spike that would be found", "record", f"spike [{self.campaign.y_unit}]", heights)
         return [Finding(self.name, "ok", sentence, value=least.max(), picture=picture)]
 
     def _finding(
