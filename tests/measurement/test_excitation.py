@@ -13,7 +13,8 @@ from scipy import signal, stats
 from scipy.io import loadmat
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.excitation import (
+from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
+from avis_ctrl.measurement.excitation.design import (
     MultisineSettings,
     NoiseSettings,
     choose_lines,
@@ -21,7 +22,6 @@ from avis_ctrl.measurement.excitation import (
     noise,
     orthogonal_matrix,
 )
-from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
 from avis_ctrl.measurement.excitation.files import write_signals
 
 
