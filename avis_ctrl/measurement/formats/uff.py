@@ -19,7 +19,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import ALLOWED, INPUT_NAME, Unit, reading, require_small, unit_of
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
-from avis_ctrl.measurement.formats.response import response_from
+from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -251,18 +251,17 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
     if len(units) > 1:
         raise InputError("expected one unit of all frequency responses", field="units", value=sorted(units))
     output_unit, input_unit = units.pop()
-    averages = hints.averages if hints.averages is not None else _averages(found)
-    return response_from(
-        frequency,
-        value,
-        [input_names[u] for u in inputs],
-        [output_names[y] for y in outputs],
-        coherence=coherence if complete else None,
-        averages=averages,
-        input_unit=input_unit,
-        output_unit=output_unit,
-        relative_standard_deviation=hints.relative_standard_deviation,
-    )
+    fields = {
+        "frequency_Hz": frequency,
+        "value": value,
+        "coherence": coherence if complete else None,
+        "averages": _averages(found),
+        "inputs": [input_names[u] for u in inputs],
+        "outputs": [output_names[y] for y in outputs],
+        "input_unit": input_unit,
+        "output_unit": output_unit,
+    }
+    return stated_response(fields, replace(hints, u_unit=None, y_unit=None))  # the units have already been applied
 
 
 def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Function]:
