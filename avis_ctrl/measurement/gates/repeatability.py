@@ -115,12 +115,13 @@ class Comparison(Gate):
 
     def conclude(self, kept: list[_Kept | None]) -> list[Finding]:
         groups, n_y = _by_kind_and_level(kept), len(self.campaign.y_names)
-        pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
+        pairs = [(first, b) for first, *others in groups.values() for b in others if len(b.of.f) == len(first.of.f)]
         level = FINDING.false_alarm / max(1, len(pairs) * n_y)
-        repeats = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
+        compared = [difference([a], [b], level, (f"record {a.record}", f"record {b.record}")) for a, b in pairs]
+        repeats = [*filter(None, compared)]
         apart = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
         level = FINDING.false_alarm / max(1, len(apart) * n_y)
-        levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
+        compared = [difference(groups[a], groups[b], level, (f"{a[1]:g} V", f"{b[1]:g} V")) for a, b in apart]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         untested = "Repeatability was not tested: no two driven records of one level and enough length."
         found = _judged(self.name, repeats, self.campaign, _drifted, agreed, untested)
@@ -129,7 +130,7 @@ class Comparison(Gate):
             f"least a factor {SETTINGS.apart:g} apart."
         )
         agreed = "The responses at all levels agree"
-        return found + _judged(LEVEL_DEPENDENCE, levels, self.campaign, _nonlinear, agreed, untested)
+        return found + _judged(LEVEL_DEPENDENCE, [*filter(None, compared)], self.campaign, _nonlinear, agreed, untested)
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
@@ -208,21 +209,12 @@ def _rounded(level: float) -> float:
     return float(f"{level:.2g}")
 
 
-def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
-    """Difference of two records; None if they cannot be compared."""
-    names = f"record {a.record}", f"record {b.record}"
-    if (found := _same_input(a, b, level, names)) is not None or len(a.of.f) != len(b.of.f):
-        return found
-    return _compared([a.of], [b.of], level, names)
-
-
-def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | None:
-    names = f"{_rounded(a[0].level):g} V", f"{_rounded(b[0].level):g} V"
+def difference(a: list[_Kept], b: list[_Kept], level: float, names: tuple[str, str]) -> Difference | None:
+    """Difference of two groups of records; None if they cannot be compared."""
     for one in a:
         for other in b:
             if (d := _same_input(one, other, level, names)) is not None:
                 return d
-
     first, second = ([k.of for k in group if len(k.of.f) == len(group[0].of.f)] for group in (a, b))
     return _compared(first, second, level, names)
 
