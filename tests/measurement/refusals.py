@@ -9,7 +9,7 @@ from avis_ctrl.measurement.formats import read_measurements
 
 
 def refused(message, path, *columns, **hints):
-    """The one line that ends the reading: it begins with the file and matches the message."""
+    """The one line that ends the reading: it begins with the file and matches the message (None: any)."""
     with pytest.raises(InputError, match=message) as caught:
         read_measurements(path, *columns, **hints)
     said = str(caught.value)

@@ -155,18 +155,18 @@ def test_garbage_behind_a_good_beginning(tmp_path_factory, content, head):
 
 def test_what_is_no_measurement_at_all(tmp_path):
     path = tmp_path / "a.h5"
-    assert refused("", path) == f"{path}: no such file"
-    assert refused("", tmp_path) == f"{tmp_path}: expected CSV files (*.csv) in the directory; there is none"
+    assert refused(None, path) == f"{path}: no such file"
+    assert refused(None, tmp_path) == f"{tmp_path}: expected CSV files (*.csv) in the directory; there is none"
     path.write_bytes(b"")
-    assert refused("", path) == f"{path}: the file is empty (0 bytes)"
+    assert refused(None, path) == f"{path}: the file is empty (0 bytes)"
     path.write_bytes(np.random.default_rng(1).bytes(5000))
-    assert refused("", path) == (
+    assert refused(None, path) == (
         f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them"
     )
     path.write_text("just words\nand more\n")
-    assert "line 1 = 'just words': not a measurement file: a text" in refused("", path)
-    assert "cannot be opened" in refused("", tmp_path / ("long" * 100))
-    assert "cannot be opened" in refused("", tmp_path / "x\0y")
+    assert "line 1 = 'just words': not a measurement file: a text" in refused(None, path)
+    assert "cannot be opened" in refused(None, tmp_path / ("long" * 100))
+    assert "cannot be opened" in refused(None, tmp_path / "x\0y")
 
 
 def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
@@ -188,7 +188,7 @@ def test_messages_of_cut_files(valid, tmp_path):
     }
     for kind, (share, message) in parts.items():
         path.write_bytes(valid[kind][: int(share * len(valid[kind]))])
-        assert message in refused("", path), kind
+        assert message in refused(None, path), kind
 
 
 def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
@@ -201,10 +201,10 @@ def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
     ):
         with pytest.raises(InputError, match=said):
             read_measurements(path, **hint)
-    assert "columns = 'x': expected the roles t, u, y" in refused("", path, columns={"x": "A1"})
-    assert "columns: y = 'S9': not found; the file has t, A1, S1" in refused("", path, columns={"y": "S9", "u": "A1"})
+    assert "columns = 'x': expected the roles t, u, y" in refused(None, path, columns={"x": "A1"})
+    assert "columns: y = 'S9': not found; the file has t, A1, S1" in refused(None, path, columns={"y": "S9", "u": "A1"})
     path.write_bytes(valid["h5"])
-    assert "period_s = 1.0: an HDF5 campaign states this itself" in refused("", path, period_s=1.0)
+    assert "period_s = 1.0: an HDF5 campaign states this itself" in refused(None, path, period_s=1.0)
 
 
 def test_columns_from_a_command_line():
@@ -233,7 +233,7 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     content = time_function("A1", [1.0] * 12, True)
     path = tmp_path / "a"
     path.write_bytes(content.replace(f"{2:10d}{12:10d}".encode(), f"{2:10d}{999999999:10d}".encode()))
-    assert "expected 3999999996 bytes for 999999999 values" in refused("", path)
+    assert "expected 3999999996 bytes for 999999999 values" in refused(None, path)
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
     assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refused(
         "", path, excitation="rest", columns={"y": "A1"}
@@ -246,7 +246,7 @@ def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_di
     path.write_bytes(valid[kind] + b"\n" * 5000 if kind == "csv" else valid[kind])
     with path.open("r+b") as stream:
         stream.truncate(3_000_000_000)  # a hole: takes no place on disk
-    assert refused("", path) == (
+    assert refused(None, path) == (
         f"{path}: has 3 GB; this format is read whole, up to 1.5 GB: convert the file to an HDF5 "
         "campaign (/records/00/u and y), which is read in pieces"
     )
@@ -264,12 +264,12 @@ def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeyp
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     assert path.stat().st_size < 1e6
-    assert "has 3 GB; this format is read whole" in refused("", path, columns={"u": "u", "y": ["y", "z"]})
+    assert "has 3 GB; this format is read whole" in refused(None, path, columns={"u": "u", "y": ["y", "z"]})
     record = read_measurements(path, excitation="noise", level_V=1.0).records[0]  # one variable each stays on disk
     assert record.load(samples - 3).y.shape == (3, 1)
     monkeypatch.setattr(common, "SETTINGS", common.ReadingSettings(5000))
     scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
-    assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refused("", path)
+    assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refused(None, path)
     scipy.io.savemat(path, {"u": np.zeros(200), "y": np.zeros(200), "fs": 1.0}, do_compression=True)
     assert not isinstance(read_whole(path), str)
 
@@ -279,4 +279,4 @@ def test_csv_files_of_a_directory_count_together(valid, tmp_path):
         (tmp_path / f"{name}.csv").write_bytes(valid["csv"])
         with (tmp_path / f"{name}.csv").open("r+b") as stream:
             stream.truncate(600_000_000)
-    assert refused("", tmp_path).startswith(f"{tmp_path}: has 1.8 GB; this format is read whole")
+    assert refused(None, tmp_path).startswith(f"{tmp_path}: has 1.8 GB; this format is read whole")
