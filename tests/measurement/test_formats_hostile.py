@@ -198,10 +198,10 @@ def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
         ({"speed": 3}, "hint = 'speed': expected one of sample_rate_Hz, excitation"),
         ({"sample_rate_Hz": "1 kHz"}, "sample_rate_Hz = '1 kHz': expected one number"),
         ({"excitation": "loud"}, "excitation = 'loud': expected one of"),
+        ({"columns": {"x": "A1"}}, "columns = 'x': expected the roles t, u, y"),
     ):
         with pytest.raises(InputError, match=said):
             read_measurements(path, **hint)
-    assert "columns = 'x': expected the roles t, u, y" in refused(None, path, columns={"x": "A1"})
     assert "columns: y = 'S9': not found; the file has t, A1, S1" in refused(None, path, columns={"y": "S9", "u": "A1"})
     path.write_bytes(valid["h5"])
     assert "period_s = 1.0: an HDF5 campaign states this itself" in refused(None, path, period_s=1.0)
