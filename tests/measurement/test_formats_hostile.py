@@ -236,7 +236,7 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     assert "expected 3999999996 bytes for 999999999 values" in refused(None, path)
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
     assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refused(
-        "", path, excitation="rest", columns={"y": "A1"}
+        None, path, excitation="rest", columns={"y": "A1"}
     )
 
 
