@@ -28,7 +28,7 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
-from avis_ctrl.measurement.excitation import band_limited
+from avis_ctrl.measurement.excitation.design import band_limited
 from avis_ctrl.measurement.formats.hdf5 import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.floor_spectrum import realise, shipped_spectrum

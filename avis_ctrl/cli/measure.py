@@ -56,7 +56,7 @@ def excite(
     seed: Annotated[int, EXCITE("--seed")] = 1,
 ) -> None:
     """Generate excitation signals for the rig: multisines of low crest factor, or noise, within its voltage limit."""
-    from avis_ctrl.measurement.excitation import MultisineSettings, NoiseSettings, multisine, noise
+    from avis_ctrl.measurement.excitation.design import MultisineSettings, NoiseSettings, multisine, noise
     from avis_ctrl.measurement.excitation.files import require_suffix, write_signals
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.simulation.campaign_data import largest_level, open_loop

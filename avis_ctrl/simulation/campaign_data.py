@@ -15,7 +15,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.statespace import gain
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
-from avis_ctrl.measurement.excitation import (
+from avis_ctrl.measurement.excitation.design import (
     ExcitationSignals,
     MultisineSettings,
     NoiseSettings,

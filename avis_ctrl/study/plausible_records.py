@@ -22,7 +22,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.measurement.gates.excerpt import excerpt
-from avis_ctrl.measurement.gates.h1 import h1, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.h1 import h1, segment_length, usable
 from avis_ctrl.rigs.plausible_ranges import RANGES, Range
 
 
@@ -200,11 +200,12 @@ def record_spectra(measured: Campaign) -> RecordSpectra | None:
         seen = excerpt(record, SETTINGS.samples)
         if not seen.driven:
             continue
-        u, y, wrap = usable(seen)
-        peak_u, peak_y = np.maximum(peak_u, np.abs(u).max(axis=0)), max(peak_y, float(np.abs(y).max()))
-        length = length or segment_length(len(u), int(np.count_nonzero(np.ptp(u, axis=0))))
-        if len(u) >= length:
-            parts.append(spectra(u, y, seen.header.sample_rate_Hz, length, wrap))
+        samples = usable(seen)
+        peak_u = np.maximum(peak_u, np.abs(samples.u).max(axis=0))
+        peak_y = max(peak_y, float(np.abs(samples.y).max()))
+        length = length or segment_length(len(samples.u), samples.moving)
+        if len(samples.u) >= length:
+            parts.append(samples.spectra(length))
     estimate = h1(parts) if parts else None
     if estimate is None:
         return None

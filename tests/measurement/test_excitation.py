@@ -13,7 +13,8 @@ from scipy import signal, stats
 from scipy.io import loadmat
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.measurement.excitation import (
+from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
+from avis_ctrl.measurement.excitation.design import (
     MultisineSettings,
     NoiseSettings,
     choose_lines,
@@ -21,7 +22,6 @@ from avis_ctrl.measurement.excitation import (
     noise,
     orthogonal_matrix,
 )
-from avis_ctrl.measurement.excitation.crest_factor import crest_factor, low_crest_phases, synthesise
 from avis_ctrl.measurement.excitation.files import write_signals
 
 
@@ -82,7 +82,7 @@ def test_experiments_are_orthogonal_at_every_line_and_silent_elsewhere(n_u):
     signals = multisine(wanted(n_u, realisations=2))
     assert signals.u.shape == (2 * n_u, 1000, n_u)
     U = spectrum(signals.u)
-    lines = np.round(signals.line_Hz * 2.0).astype(int)
+    lines = signals.settings.grid()
     assert np.array_equal(lines, np.arange(2, 121))
     for r in range(2):
         of_one = np.moveaxis(U[r * n_u : (r + 1) * n_u, lines], 0, -1)  # (lines, inputs, experiments)
@@ -120,7 +120,7 @@ def test_zippered_lines_belong_to_one_input_each_and_to_all_in_turn():
     signals = multisine(wanted(3, scheme="zippered", realisations=3))
     power = np.abs(spectrum(signals.u)) ** 2
     owner = power > 1e-6 * power.max()
-    lines = np.round(signals.line_Hz * 2.0).astype(int)
+    lines = signals.settings.grid()
     assert signals.u.shape == (3, 1000, 3)
     assert np.all(owner[:, lines].sum(axis=2) == 1) and owner.sum() == 3 * lines.size
     assert np.all(owner[:, lines].sum(axis=0) == 1)
@@ -135,13 +135,9 @@ def test_the_held_voltage_is_flat_where_the_hold_is_compensated():
     for compensated in (True, False):
         signals = multisine(wanted(2, compensate_hold=compensated, band_Hz=(1.0, 200.0)))
         fine = np.repeat(signals.u[0, :, 1], 200)
-        held = np.abs(np.fft.rfft(fine))[np.round(signals.line_Hz * 2).astype(int)]
+        held = np.abs(np.fft.rfft(fine))[signals.settings.grid()]
         assert np.allclose(held / held[0], 1.0, rtol=1e-5) if compensated else held[-1] < 0.8 * held[0]
-    again = multisine(
-        MultisineSettings(
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in signals.settings.items()}
-        )
-    )
+    again = multisine(signals.settings)
     assert np.array_equal(again.u, signals.u)  # the settings reproduce the signals
 
 

@@ -10,7 +10,9 @@ import pytest
 import scipy.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 from test_formats_matlab import Matlab73
+from test_formats_uff import data_set
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
@@ -31,20 +33,8 @@ CSV = "# excitation = noise\r\nt [s];A1 [V];S1 [mV]\r\n" + "".join(
 
 def time_function(name, values, binary):
     """A data set 58 or 58b of a real, single precision, even time response."""
-    head = ["NONE"] * 5 + [
-        f"{1:5d}{0:10d}{0:5d}{0:10d} {name:10s}{1:10d}{3:4d} {'NONE':10s}{0:10d}{0:4d}",
-        f"{2:10d}{len(values):10d}{1:10d}{0.0:13.5E}{0.125:13.5E}{0.0:13.5E}",
-        f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':20s} {'s':20s}",
-        f"{1:10d}{0:5d}{0:5d}{0:5d} {'Voltage':20s} {'V':20s}",
-    ]
-    head += [f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':20s} {'NONE':20s}"] * 2
-    if binary:
-        body = np.asarray(values, "<f4").tobytes()
-        title = f"{58:6d}b{1:6d}{2:6d}{11:12d}{len(body):12d}{0:6d}{0:6d}{0:12d}{0:12d}"
-    else:
-        body = "".join(f"{v:13.5E}" + "\n" * (i % 6 == 5) for i, v in enumerate(values)).encode()
-        title = f"{58:6d}"
-    return ("    -1\n" + "\n".join([title, *head]) + "\n").encode() + body + b"\n    -1\n"
+    order = "<" if binary else None
+    return data_set(values, name=name, step=0.125, ordinate=(1, "V"), order=order, double=False)
 
 
 class Files(dict):
@@ -163,26 +153,20 @@ def test_garbage_behind_a_good_beginning(tmp_path_factory, content, head):
     read_whole(path)
 
 
-def refusal(path, **hints):
-    with pytest.raises(InputError) as caught:
-        read_measurements(path, **hints)
-    return str(caught.value)
-
-
 def test_what_is_no_measurement_at_all(tmp_path):
     path = tmp_path / "a.h5"
-    assert refusal(path) == f"{path}: no such file"
-    assert refusal(tmp_path) == f"{tmp_path}: expected CSV files (*.csv) in the directory; there is none"
+    assert refused(None, path) == f"{path}: no such file"
+    assert refused(None, tmp_path) == f"{tmp_path}: expected CSV files (*.csv) in the directory; there is none"
     path.write_bytes(b"")
-    assert refusal(path) == f"{path}: the file is empty (0 bytes)"
+    assert refused(None, path) == f"{path}: the file is empty (0 bytes)"
     path.write_bytes(np.random.default_rng(1).bytes(5000))
-    assert refusal(path) == (
+    assert refused(None, path) == (
         f"{path}: expected HDF5, MATLAB .mat (v5 to v7.3), UFF 58 or CSV; the content is none of them"
     )
     path.write_text("just words\nand more\n")
-    assert "line 1 = 'just words': not a measurement file: a text" in refusal(path)
-    assert "cannot be opened" in refusal(tmp_path / ("long" * 100))
-    assert "cannot be opened" in refusal(tmp_path / "x\0y")
+    assert "line 1 = 'just words': not a measurement file: a text" in refused(None, path)
+    assert "cannot be opened" in refused(None, tmp_path / ("long" * 100))
+    assert "cannot be opened" in refused(None, tmp_path / "x\0y")
 
 
 def test_the_content_tells_the_format_not_the_name(valid, tmp_path):
@@ -204,19 +188,23 @@ def test_messages_of_cut_files(valid, tmp_path):
     }
     for kind, (share, message) in parts.items():
         path.write_bytes(valid[kind][: int(share * len(valid[kind]))])
-        assert message in refusal(path), kind
+        assert message in refused(None, path), kind
 
 
 def test_hints_and_columns_that_nobody_knows(valid, tmp_path):
     path = tmp_path / "a"
     path.write_bytes(valid["csv"])
-    assert "hint = 'speed': expected one of sample_rate_Hz, excitation" in refusal(path, speed=3)
-    assert "sample_rate_Hz = '1 kHz': expected one number" in refusal(path, sample_rate_Hz="1 kHz")
-    assert "excitation = 'loud': expected one of" in refusal(path, excitation="loud")
-    assert "columns = 'x': expected the roles t, u, y" in refusal(path, columns={"x": "A1"})
-    assert "columns: y = 'S9': not found; the file has t, A1, S1" in refusal(path, columns={"y": "S9", "u": "A1"})
+    for hint, said in (
+        ({"speed": 3}, "hint = 'speed': expected one of sample_rate_Hz, excitation"),
+        ({"sample_rate_Hz": "1 kHz"}, "sample_rate_Hz = '1 kHz': expected one number"),
+        ({"excitation": "loud"}, "excitation = 'loud': expected one of"),
+        ({"columns": {"x": "A1"}}, "columns = 'x': expected the roles t, u, y"),
+    ):
+        with pytest.raises(InputError, match=said):
+            read_measurements(path, **hint)
+    assert "columns: y = 'S9': not found; the file has t, A1, S1" in refused(None, path, columns={"y": "S9", "u": "A1"})
     path.write_bytes(valid["h5"])
-    assert "period_s = 1.0: an HDF5 campaign states this itself" in refusal(path, period_s=1.0)
+    assert "period_s = 1.0: an HDF5 campaign states this itself" in refused(None, path, period_s=1.0)
 
 
 def test_columns_from_a_command_line():
@@ -245,10 +233,10 @@ def test_a_uff_that_states_a_huge_number_of_values(tmp_path):
     content = time_function("A1", [1.0] * 12, True)
     path = tmp_path / "a"
     path.write_bytes(content.replace(f"{2:10d}{12:10d}".encode(), f"{2:10d}{999999999:10d}".encode()))
-    assert "expected 3999999996 bytes for 999999999 values" in refusal(path)
+    assert "expected 3999999996 bytes for 999999999 values" in refused(None, path)
     path.write_bytes(content.replace(struct.pack("<f", 1.0), struct.pack("<f", np.nan), 1))
-    assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refusal(
-        path, excitation="rest", columns={"y": "A1"}
+    assert "NaN or infinite: 1, the first at sample 0 of channel A1" in refused(
+        None, path, excitation="rest", columns={"y": "A1"}
     )
 
 
@@ -258,7 +246,7 @@ def test_formats_that_are_read_whole_are_refused_beyond_memory_by_the_size_on_di
     path.write_bytes(valid[kind] + b"\n" * 5000 if kind == "csv" else valid[kind])
     with path.open("r+b") as stream:
         stream.truncate(3_000_000_000)  # a hole: takes no place on disk
-    assert refusal(path) == (
+    assert refused(None, path) == (
         f"{path}: has 3 GB; this format is read whole, up to 1.5 GB: convert the file to an HDF5 "
         "campaign (/records/00/u and y), which is read in pieces"
     )
@@ -276,12 +264,12 @@ def test_what_is_large_only_when_it_is_unpacked_is_refused_too(tmp_path, monkeyp
     with path.open("r+b") as stream:
         stream.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     assert path.stat().st_size < 1e6
-    assert "has 3 GB; this format is read whole" in refusal(path, columns={"u": "u", "y": ["y", "z"]})
+    assert "has 3 GB; this format is read whole" in refused(None, path, columns={"u": "u", "y": ["y", "z"]})
     record = read_measurements(path, excitation="noise", level_V=1.0).records[0]  # one variable each stays on disk
     assert record.load(samples - 3).y.shape == (3, 1)
     monkeypatch.setattr(common, "SETTINGS", common.ReadingSettings(5000))
     scipy.io.savemat(path, {"u": np.zeros(400), "y": np.zeros(400), "fs": 1.0}, do_compression=True)
-    assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refusal(path)
+    assert path.stat().st_size < 1000 and "has 6.5e-06 GB; this format is read whole" in refused(None, path)
     scipy.io.savemat(path, {"u": np.zeros(200), "y": np.zeros(200), "fs": 1.0}, do_compression=True)
     assert not isinstance(read_whole(path), str)
 
@@ -291,4 +279,4 @@ def test_csv_files_of_a_directory_count_together(valid, tmp_path):
         (tmp_path / f"{name}.csv").write_bytes(valid["csv"])
         with (tmp_path / f"{name}.csv").open("r+b") as stream:
             stream.truncate(600_000_000)
-    assert refusal(tmp_path).startswith(f"{tmp_path}: has 1.8 GB; this format is read whole")
+    assert refused(None, tmp_path).startswith(f"{tmp_path}: has 1.8 GB; this format is read whole")

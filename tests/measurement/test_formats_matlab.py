@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from refusals import refused
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import digest
@@ -153,8 +154,7 @@ def test_flat_matrices_that_only_names_or_time_can_tell(path, rng):
     u, y = rng.normal(size=(4, 6)), rng.normal(size=(4, 6))
     tree = {"u": u, "y": y, "fs": 10.0}
     scipy.io.savemat(path, tree)
-    with pytest.raises(InputError, match="rows and columns could both be the samples: u is 4x6, y is 4x6"):
-        read_measurements(path)
+    refused("rows and columns could both be the samples: u is 4x6, y is 4x6", path)
     scipy.io.savemat(path, tree | {"t": np.arange(6) / 10})
     np.testing.assert_array_equal(read_measurements(path).records[0].load().y, y.T)
     scipy.io.savemat(path, tree | {"u_names": cells(list("abcdef"))})
@@ -170,10 +170,8 @@ def test_real_data_by_a_mapping(data):
     box = data / "silverbox" / "Schroeder80mV.mat"
     record = read_measurements(box, {"u": "V1", "y": "V2"}, sample_rate_Hz=610.35).records[0].load()
     np.testing.assert_array_equal(record.u[:, 0], scipy.io.loadmat(box)["V1"][0])
-    with pytest.raises(InputError, match="u: no variable has a usual name"):
-        read_measurements(box)
-    with pytest.raises(InputError, match="sample rate: expected t, fs or sample_rate_Hz"):
-        read_measurements(box, {"u": "V1", "y": "V2"})
+    refused("u: no variable has a usual name", box)
+    refused("sample rate: expected t, fs or sample_rate_Hz", box, {"u": "V1", "y": "V2"})
 
 
 @both
@@ -226,8 +224,7 @@ def test_as_many_lines_as_channels_are_refused(path, rng):
             "outputs": cells(["c", "d"]),
         },
     )
-    with pytest.raises(InputError, match="the dimension of frequency is ambiguous"):
-        read_measurements(path)
+    refused("the dimension of frequency is ambiguous", path)
 
 
 WRONG = {
@@ -257,9 +254,7 @@ WRONG = {
 def test_wrong_records_in_one_line(path, rng, version, case):
     changes, message = WRONG[case]
     save(path, version, {"records": fields(rng, **changes), "rig": "avis"})
-    with pytest.raises(InputError, match=message) as caught:
-        read_measurements(path)
-    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+    refused(message, path)
 
 
 @both
@@ -278,8 +273,6 @@ def test_function_handles_and_objects_are_refused_only_where_they_are_used(path,
         file["o"].attrs["MATLAB_class"] = np.bytes_("string")
     assert read_measurements(path, excitation="noise").records[0].header.samples == 50
     for name, kind in (("f", "function handle"), ("o", "MATLAB string")):
-        with pytest.raises(InputError, match=f"{name} = 'a {kind}': expected a real matrix"):
-            read_measurements(path, {"u": "u", "y": name})
+        refused(f"{name} = 'a {kind}': expected a real matrix", path, {"u": "u", "y": name})
     scipy.io.savemat(path, {"u": np.zeros((9, 1), complex), "y": np.zeros((9, 1)), "fs": 1.0, "rig": 3.0})
-    with pytest.raises(InputError, match="u = 'complex array of 9x1': expected a real matrix"):
-        read_measurements(path)
+    refused("u = 'complex array of 9x1': expected a real matrix", path)

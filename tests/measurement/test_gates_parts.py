@@ -17,7 +17,7 @@ from avis_ctrl.measurement.gates.channel_faults import MapSettings, compare, exp
 from avis_ctrl.measurement.gates.clipping import over_range, repeated_extreme
 from avis_ctrl.measurement.gates.dead_channel import equal_runs
 from avis_ctrl.measurement.gates.excerpt import excerpt
-from avis_ctrl.measurement.gates.h1 import Spectra, h1, spectra
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, h1
 from avis_ctrl.measurement.gates.hum import Hum
 from avis_ctrl.measurement.gates.missing_samples import delay_step, drifts, repeated_block
 from avis_ctrl.measurement.gates.periodicity import Periodicity, compared
@@ -138,7 +138,7 @@ def test_h1_of_white_noise_is_the_gain_with_its_stated_error(rng):
     G = np.array([[1.0, -2.0], [0.5, 0.0], [0.0, 3.0]])
     u = rng.standard_normal((40000, 2))
     y = u @ G.T + 0.1 * rng.standard_normal((40000, 3))
-    made = h1([spectra(u, y, 100.0, 256, wrap=False)])
+    made = h1([Samples(u, y, 100.0).spectra(256)])
     np.testing.assert_allclose(made.G.mean(axis=0).real, G, atol=0.005)
     variance = np.einsum("fi,fjj->fij", made.noise, made.covariance).real
     ratio = np.mean(np.abs(made.G - G) ** 2 / variance)
@@ -205,8 +205,8 @@ def test_false_alarms_of_hum(colour):
     hits = 0
     for seed in range(100):
         record = rest(np.random.default_rng(seed), colour=colour)
-        gate = Hum()
-        found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+        gate = Hum(Campaign("x", (record,)), Expectation())
+        found = gate.conclude([gate.look(excerpt(record))])
         hits += any(f.severity != "ok" for f in found)
     assert hits <= 4
 
@@ -219,8 +219,8 @@ def test_hum_names_mains_channel_and_size(rng, mains, off):
     y = record.y.copy()
     y[:, 2] += 0.4 * np.sin(2 * np.pi * (mains * off) * np.arange(len(y)) / 1000)
     record = Record(record.header, record.u, y)
-    gate = Hum()
-    found = gate.conclude([gate.look(excerpt(record), Expectation())], Campaign("x", (record,)), Expectation())
+    gate = Hum(Campaign("x", (record,)), Expectation())
+    found = gate.conclude([gate.look(excerpt(record))])
     assert [(f.channels, f.severity) for f in found] == [(("y2",), "warning")]
     assert f"carries mains hum at {mains:g} Hz:" in found[0].sentence
     said = re.search(r"Hz: at (\S+) Hz (\S+) V r\.m\.s\.", found[0].sentence)
@@ -269,7 +269,7 @@ def test_a_channel_that_differs_only_before_the_reference_has_settled():
     header = RecordHeader("00", 100.0, 600, ("u",), ("a", "b"), "multisine", 1.0, 0.0, 1.0)
     campaign = Campaign("x", (Record(header, np.zeros((600, 1)), np.zeros((600, 2))),))
     periods = periodicity._Kept("00", 1.0, T, 0.1 * T, 50, 2)
-    (finding,) = Periodicity().conclude([periods], campaign, Expectation())
+    (finding,) = Periodicity(campaign, Expectation()).conclude([periods])
     assert finding.severity == "warning" and finding.channels == ("a",)
 
 

@@ -40,8 +40,13 @@ def crest_factor(u: np.ndarray) -> np.ndarray:
 
 def synthesise(lines: np.ndarray, amplitude: np.ndarray, phase: np.ndarray, samples: int) -> np.ndarray:
     """Sum of amplitude cos(2 pi k n / samples + phase) over the lines k, (..., samples) for phase (..., n_lines)."""
-    spectrum = np.zeros((*np.shape(phase)[:-1], samples // 2 + 1), complex)
-    spectrum[..., lines] = 0.5 * samples * amplitude * np.exp(1j * np.asarray(phase))
+    return _sum(lines, amplitude * np.exp(1j * np.asarray(phase)), samples)
+
+
+def _sum(lines: np.ndarray, phasors: np.ndarray, samples: int) -> np.ndarray:
+    """(..., samples) sum of the cosines with phasors (..., n_lines)."""
+    spectrum = np.zeros((*phasors.shape[:-1], samples // 2 + 1), complex)
+    spectrum[..., lines] = 0.5 * samples * phasors
     return np.fft.irfft(spectrum, samples)
 
 
@@ -58,15 +63,10 @@ def low_crest_phases(
     turns = np.exp(1j * (np.zeros(1) if rotations is None else np.asarray(rotations)))[:, None]
     best, lowest = phase, np.inf
 
-    def signals(phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        lines_now = amplitude * np.exp(1j * phi) * turns
-        spectrum = np.zeros((len(turns), samples // 2 + 1), complex)
-        spectrum[:, lines] = 0.5 * samples * lines_now
-        return lines_now, np.fft.irfft(spectrum, samples)
-
     def log_norm(phi: np.ndarray, p: int) -> tuple[float, np.ndarray]:
         """log of the p-norm over all samples and rotations, and its gradient."""
-        lines_now, u = signals(phi)
+        phasors = amplitude * np.exp(1j * phi) * turns
+        u = _sum(lines, phasors, samples)
         peak = np.max(np.abs(u))
         ratio = u / peak
         square = ratio * ratio
@@ -77,7 +77,7 @@ def low_crest_phases(
         total = np.vdot(power, square)
         slope = power * ratio / (total * peak)
         # d u_n / d phi_k = Re(j A_k exp(j phi_k) exp(2 pi j k n / N))
-        gradient = np.real(1j * lines_now * np.conj(np.fft.rfft(slope)[:, lines])).sum(axis=0)
+        gradient = np.real(1j * phasors * np.conj(np.fft.rfft(slope)[:, lines])).sum(axis=0)
         return float(np.log(peak) + np.log(total / u.size) / p), gradient
 
     for p in (0, *SETTINGS.exponents):
@@ -85,7 +85,7 @@ def low_crest_phases(
             phase = minimize(
                 log_norm, phase, args=(p,), jac=True, method="L-BFGS-B", options={"maxiter": SETTINGS.steps}
             ).x
-        peak = float(np.max(np.abs(signals(phase)[1])))
+        peak = float(np.max(np.abs(_sum(lines, amplitude * np.exp(1j * phase) * turns, samples))))
         if peak < lowest:
             best, lowest = phase, peak
     return best

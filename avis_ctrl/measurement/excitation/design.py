@@ -22,7 +22,7 @@ on the distribution, and is then valid for signals of this kind.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -52,24 +52,32 @@ class ExcitationSignals:
 
     Attributes
     ----------
-    kind : "multisine" (one period each, to be repeated) or "noise".
-    u : (records, samples, n_u) V, held between samples.
-    period_s : period of a multisine, otherwise None.
-    line_Hz : (n_lines,) excited lines of all inputs; empty for noise.
-    limit_V : maximum voltage.
+    settings : of the design, with the r.m.s. voltage of the signals; they reproduce the signals.
+    u : (records, samples, n_u) V, held between samples; one period of a multisine, to be repeated.
     crest_before : (records, n_u) crest factor with the initial random phases.
-    settings : all settings used for the design, including the seed, as plain values.
     """
 
-    kind: str
-    inputs: tuple[str, ...]
-    sample_rate_Hz: float
+    settings: MultisineSettings | NoiseSettings
     u: np.ndarray
-    period_s: float | None
-    line_Hz: np.ndarray
-    limit_V: float
     crest_before: np.ndarray
-    settings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def period_s(self) -> float | None:
+        """Period of a multisine; None for noise."""
+        return self.settings.period_s if isinstance(self.settings, MultisineSettings) else None
+
+    @property
+    def kind(self) -> str:
+        """ "multisine" or "noise"."""
+        return "noise" if self.period_s is None else "multisine"
+
+    def stated(self) -> dict[str, Any]:
+        """The settings as numbers, strings and lists, for files."""
+        values = {
+            name: value.item() if isinstance(value, np.generic) else value
+            for name, value in vars(self.settings).items()
+        }
+        return values | {"inputs": list(self.settings.inputs), "band_Hz": [float(f) for f in self.settings.band_Hz]}
 
     @property
     def rms_V(self) -> np.ndarray:
@@ -93,18 +101,19 @@ class ExcitationSignals:
         ------
         InputError : a level that needs more than limit_V; the message gives the largest possible level.
         """
-        largest = float(self.limit_V / np.max(self.crest))
+        limit_V = self.settings.limit_V
+        largest = float(limit_V / np.max(self.crest))
         rms_V = largest if rms_V is None else rms_V
         require_positive(rms_V, "rms_V")
         if rms_V > largest * (1 + 1e-12):
             message = (
-                f"expected at most {largest:.6g} V r.m.s.: with a crest factor of {self.limit_V / largest:.3f} more "
-                f"would exceed the limit of {self.limit_V:g} V"
+                f"expected at most {largest:.6g} V r.m.s.: with a crest factor of {limit_V / largest:.3f} more "
+                f"would exceed the limit of {limit_V:g} V"
             )
             raise InputError(message, field="rms_V", value=rms_V)
         # Round-off must not push the peak beyond the limit.
-        u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -self.limit_V, self.limit_V)
-        return replace(self, u=u, settings=self.settings | {"rms_V": float(rms_V)})
+        u = np.clip(self.u * (rms_V / self.rms_V[:, None, :]), -limit_V, limit_V)
+        return replace(self, u=u, settings=replace(self.settings, rms_V=float(rms_V)))
 
 
 @dataclass(frozen=True)
@@ -156,10 +165,8 @@ class MultisineSettings:
         require_positive(self.period_s, "period_s")
         samples = self.period_s * self.sample_rate_Hz
         if abs(samples - round(samples)) > 1e-6 * samples or round(samples) < 4:
-            message = (
-                f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is {samples:.6g}"
-            )
-            raise InputError(message, field="period_s", value=self.period_s)
+            message = f"expected a whole number of samples, at least 4; at {self.sample_rate_Hz:g} Hz it is"
+            raise InputError(f"{message} {samples:.6g}", field="period_s", value=self.period_s)
         for name, known in (("lines", get_args(Lines)), ("scheme", get_args(Scheme))):
             if getattr(self, name) not in known:
                 raise InputError(f"expected one of {', '.join(known)}", field=name, value=getattr(self, name))
@@ -201,17 +208,8 @@ def multisine(settings: MultisineSettings) -> ExcitationSignals:
             record[:, :, i], drawn[:, :, i] = _one_input(lines[own], amplitude[own], turns, N, settings.low_crest, rng)
         u.append(record)
         before.append(drawn)
-    return ExcitationSignals(
-        "multisine",
-        settings.inputs,
-        settings.sample_rate_Hz,
-        np.concatenate(u),
-        settings.period_s,
-        lines / settings.period_s,
-        settings.limit_V,
-        crest_factor(np.moveaxis(np.concatenate(before), 1, -1)),
-        _plain(settings),
-    ).scaled_to(settings.rms_V)
+    crest_before = crest_factor(np.moveaxis(np.concatenate(before), 1, -1))
+    return ExcitationSignals(settings, np.concatenate(u), crest_before).scaled_to(settings.rms_V)
 
 
 def _one_input(
@@ -288,17 +286,7 @@ def noise(settings: NoiseSettings) -> ExcitationSignals:
     shape = N, settings.sample_rate_Hz, settings.band_Hz, len(settings.inputs)
     u = np.array([band_limited(*shape, rng) for _ in range(settings.records)])
     u = u / np.sqrt(np.mean(u**2, axis=1, keepdims=True))
-    return ExcitationSignals(
-        "noise",
-        settings.inputs,
-        settings.sample_rate_Hz,
-        u,
-        None,
-        np.zeros(0),
-        settings.limit_V,
-        crest_factor(np.moveaxis(u, 1, -1)),
-        _plain(settings),
-    ).scaled_to(settings.rms_V)
+    return ExcitationSignals(settings, u, crest_factor(np.moveaxis(u, 1, -1))).scaled_to(settings.rms_V)
 
 
 def band_limited(
@@ -315,12 +303,6 @@ def band_limited(
     draw = rng.standard_normal((2, np.count_nonzero(inside), channels))
     spectrum[inside] = (draw[0] + 1j * draw[1]) * samples / (2 * np.sqrt(np.count_nonzero(inside)))
     return np.fft.irfft(spectrum, samples, axis=0)
-
-
-def _plain(settings: MultisineSettings | NoiseSettings) -> dict[str, Any]:
-    """Settings as numbers, strings and lists, for files."""
-    values = {name: value.item() if isinstance(value, np.generic) else value for name, value in vars(settings).items()}
-    return values | {"inputs": list(settings.inputs), "band_Hz": [float(f) for f in settings.band_Hz]}
 
 
 def _check_common(settings: MultisineSettings | NoiseSettings) -> None:

@@ -48,14 +48,15 @@ def write_signals(signals: ExcitationSignals, path: str | Path, periods: int = 1
 
 
 def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
+    rate = signals.settings.sample_rate_Hz
     with replacing(path) as file:
         file.attrs.update(
             {
                 "format": "avis-excitation",
                 "version": 1,
                 "rig": rig,
-                "seed": signals.settings.get("seed", 0),
-                "settings": json.dumps(signals.settings),
+                "seed": signals.settings.seed,
+                "settings": json.dumps(signals.stated()),
             }
         )
         for k, (one, level) in enumerate(zip(signals.u, signals.rms_V, strict=True)):
@@ -63,24 +64,24 @@ def _write_hdf5(signals: ExcitationSignals, periods: int, path: Path, rig: str) 
             group = file.create_group(f"records/{k:02d}")
             group.attrs.update(
                 {
-                    "sample_rate_Hz": signals.sample_rate_Hz,
+                    "sample_rate_Hz": rate,
                     "excitation": signals.kind,
                     "level_V": float(np.sqrt(np.mean(level**2))),
-                    "start_s": k * len(record) / signals.sample_rate_Hz,
+                    "start_s": k * len(record) / rate,
                 }
             )
             if signals.period_s is not None:
                 group.attrs["period_s"] = signals.period_s
             volts = group.create_dataset("u", data=record)
-            volts.attrs.update({"names": list(signals.inputs), "unit": "V"})
+            volts.attrs.update({"names": list(signals.settings.inputs), "unit": "V"})
 
 
 def _write_csv(signals: ExcitationSignals, periods: int, path: Path, rig: str) -> None:
-    settings = {"rig": rig, "excitation": signals.kind, "period_s": signals.period_s, **signals.settings}
-    time = np.arange(periods * signals.u.shape[1]) / signals.sample_rate_Hz
+    settings = {"rig": rig, "excitation": signals.kind, "period_s": signals.period_s, **signals.stated()}
+    time = np.arange(periods * signals.u.shape[1]) / signals.settings.sample_rate_Hz
     with whole_file(path) as file:
         file.writelines(f"# {key} = {json.dumps(value)}\n".encode() for key, value in settings.items())
-        file.write((",".join(["record", "time_s", *signals.inputs]) + "\n").encode())
+        file.write((",".join(["record", "time_s", *signals.settings.inputs]) + "\n").encode())
         for k, record in enumerate(signals.u):
             rows = zip(time.tolist(), np.tile(record, (periods, 1)).tolist(), strict=True)
             file.writelines(f"{k},{t!r},{','.join(map(repr, row))}\n".encode() for t, row in rows)
@@ -92,14 +93,14 @@ def _write_mat(signals: ExcitationSignals, periods: int, path: Path, rig: str) -
         raise InputError(message, file=path, field="u", value=f"{total / 2**30:.1f} GiB")
     content = {
         "u": np.moveaxis(np.tile(signals.u, (1, periods, 1)), 0, -1),
-        "names": np.array(signals.inputs, object),
+        "names": np.array(signals.settings.inputs, object),
         "rig": rig,
-        "sample_rate_Hz": signals.sample_rate_Hz,
+        "sample_rate_Hz": signals.settings.sample_rate_Hz,
         "period_s": np.nan if signals.period_s is None else signals.period_s,
         "excitation": signals.kind,
         "level_V": signals.rms_V,
-        "seed": signals.settings.get("seed", 0),
-        "settings": json.dumps(signals.settings),
+        "seed": signals.settings.seed,
+        "settings": json.dumps(signals.stated()),
     }
     with whole_file(path) as file:
         savemat(file, content, do_compression=True, appendmat=False)

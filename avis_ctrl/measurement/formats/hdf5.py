@@ -3,10 +3,8 @@
 Layout: attributes format = "avis-campaign", version = 1, rig; groups /records/<name> with the data sets u, y and, if
 measured, floor.
 
-A frequency response is stored in the group /frf instead of /records: data sets frequency_Hz (n,), value (n, n_y, n_u)
-complex, and one of: variance (n, n_y, n_u); coherence with the attribute averages; noise (n, n_y, n_y) with gram (n,
-n_u, n_u), as in `FrequencyResponse`. Attributes inputs, outputs, input_unit, output_unit; optional method, dof, and
-data sets measurement_noise, distortion.
+A frequency response is stored in the group /frf instead of /records: the arrays of `stated_response` are data sets, its
+other fields attributes.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class Hints:
     """What the caller knows and the file may not state; a hint that is given overrides the file.
 
     u_unit, y_unit : unit of the numbers in the file; averages, relative_standard_deviation : of frequency responses,
-    see `response_from`.
+    see `stated_response`.
     """
 
     sample_rate_Hz: float | None = None

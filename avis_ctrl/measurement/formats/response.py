@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,119 +52,81 @@ def coherence_variance(value: np.ndarray, coherence: np.ndarray, averages: float
 
 
 def stated_response(fields: Mapping[str, Any], hints: Hints) -> FrequencyResponse:
-    """The frequency response of a self-describing file.
+    """The frequency response of a file.
 
-    fields : frequency_Hz (n,), value (n, n_y, n_u), inputs, outputs, input_unit, output_unit; one of variance,
-    coherence with averages, noise with gram; optional: method, dof, measurement_noise, distortion.
+    Without noise and gram the entries count as independent. Lines where some coherence is 0 are left out, because the
+    response is not determined there; `FrequencyResponse.method` states this.
+
+    fields : frequency_Hz (n,), value (n, n_y, n_u), inputs, outputs, input_unit, output_unit; one of variance (n, n_y,
+    n_u) E|error|^2, ordinary coherence (n, n_y, n_u) with averages, noise with gram; optional: method, dof,
+    measurement_noise, distortion. hints : relative_standard_deviation, sqrt(E|error|^2) / |G|, is used only if the file
+    states none of these.
 
     Raises
     ------
-    InputError : a unit that does not suit a response; noise with units other than SI; as in `response_from`.
+    InputError : a unit that does not suit a response; noise with units other than SI; no information on the errors, a
+        coherence outside 0 .. 1, fewer than 2 averages, wrong shapes.
     """
-    frequency, value = fields["frequency_Hz"], fields["value"]
     inputs, outputs = (as_names(fields[field], field) for field in ("inputs", "outputs"))
     over = unit_of(hints.y_unit or as_text(fields["output_unit"], "output_unit"), "output_unit", OUTPUT_UNITS)
     under = unit_of(hints.u_unit or as_text(fields["input_unit"], "input_unit"), "input_unit", INPUT_UNITS)
-    factor = over.factor / under.factor
-    common: dict[str, Any] = {
-        "input_unit": under.si,
-        "output_unit": over.si,
-        "method": as_text(fields.get("method", ""), "method"),
-    }
+    factor, method = over.factor / under.factor, as_text(fields.get("method", ""), "method")
+    labels: dict[str, Any] = {"inputs": inputs, "outputs": outputs, "input_unit": under.si, "output_unit": over.si}
     if fields.get("noise") is not None and fields.get("gram") is not None:
         if factor != 1.0:
             raise InputError("expected SI units for noise and gram", field="units", value=str(fields["output_unit"]))
         dof = fields.get("dof", np.inf)
-        common["dof"] = np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof")
-        common |= {field: fields.get(field) for field in COVARIANCES}
-        return FrequencyResponse(frequency, value, inputs=inputs, outputs=outputs, **common)
-    averages, variance = hints.averages, fields.get("variance")
-    if averages is None and fields.get("averages") is not None:
-        averages = as_number(fields["averages"], "averages")
-    return response_from(
-        frequency,
-        value * factor,
-        inputs,
-        outputs,
-        coherence=fields.get("coherence"),
-        averages=averages,
-        variance=None if variance is None else variance * factor**2,
-        relative_standard_deviation=hints.relative_standard_deviation,
-        **common,
-    )
-
-
-def response_from(
-    frequency_Hz: np.ndarray,
-    value: np.ndarray,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    *,
-    variance: np.ndarray | None = None,
-    coherence: np.ndarray | None = None,
-    averages: float | None = None,
-    relative_standard_deviation: float | None = None,
-    input_unit: str = "V",
-    output_unit: str = "V",
-    method: str = "",
-) -> FrequencyResponse:
-    """A frequency response whose entries count as independent.
-
-    frequency_Hz : (n,); value : (n, n_y, n_u) complex; variance : (n, n_y, n_u) E|error|^2; coherence : (n, n_y, n_u)
-    ordinary coherence with its number of averages; relative_standard_deviation : sqrt(E|error|^2) / |G| stated by the
-    caller, used only if the file has neither. Lines where some coherence is 0 are left out, because the response is not
-    determined there; `method` states this.
-
-    Raises
-    ------
-    InputError : no information on the errors, a coherence outside 0 .. 1, fewer than 2 averages, wrong shapes.
-    """
-    frequency_Hz, value = _plain(frequency_Hz, "frequency_Hz", "fiu"), _plain(value, "value", "fiuc").astype(complex)
-    shape = (len(frequency_Hz), len(outputs), len(inputs)) if frequency_Hz.ndim == 1 else None
+        labels["dof"] = np.inf if np.array_equal(dof, np.inf) else as_number(dof, "dof")
+        labels |= {field: fields.get(field) for field in COVARIANCES}
+        return FrequencyResponse(fields["frequency_Hz"], fields["value"], method=method, **labels)
+    frequency = _plain(fields["frequency_Hz"], "frequency_Hz", "fiu")
+    value = _plain(fields["value"], "value", "fiuc").astype(complex) * factor
+    shape = (len(frequency), len(outputs), len(inputs)) if frequency.ndim == 1 else None
     if value.shape != shape:
         raise InputError(f"expected shape {shape}: lines, outputs, inputs", field="value", value=value.shape)
-    keep = np.ones(len(frequency_Hz), bool)
-    if variance is not None:
-        variance = _plain(variance, "variance", "fiu")
+    keep, how = np.ones(len(frequency), bool), ""
+    if fields.get("variance") is not None:
+        variance = _plain(fields["variance"], "variance", "fiu") * factor**2
         if variance.shape != shape or not np.all(variance >= 0):
             message = f"expected shape {shape} and no negative or missing value"
             raise InputError(message, field="variance", value=variance.shape)
-    elif coherence is not None:
-        coherence = _coherence(coherence, value.shape, averages)
+    elif fields.get("coherence") is not None:
+        coherence, averages = _coherence(fields["coherence"], value.shape), _averages(fields, hints)
         keep = np.all(coherence > 0, axis=(1, 2))
         if not keep.any():
             raise InputError("expected a line at which no entry is 0", field="coherence")
         variance = np.zeros(value.shape)
-        assert averages is not None  # checked by _coherence
         variance[keep] = coherence_variance(value[keep], coherence[keep], averages)
-        method = f"{method}; variance from coherence, {averages:g} averages".lstrip("; ")
-    elif relative_standard_deviation is not None:
-        share = relative_standard_deviation
-        if not (np.isfinite(share) and share > 0):
+        how = f"variance from coherence, {averages:g} averages"
+    elif (share := hints.relative_standard_deviation) is not None:
+        if share <= 0:
             raise InputError("expected a positive number", field="relative_standard_deviation", value=share)
         variance = (share * np.abs(value)) ** 2
-        method = f"{method}; stated relative standard deviation {share:g}".lstrip("; ")
+        how = f"stated relative standard deviation {share:g}"
     else:
         message = (
             "the file has neither variance nor coherence; pass relative_standard_deviation (such as 0.05) to state the "
             "errors"
         )
         raise InputError(message, field="uncertainty of the frequency response")
-    if not keep.all():
-        lost = frequency_Hz[~keep]
-        method += f"; {len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz"
+    lost = frequency[~keep]
+    left_out = f"{len(lost)} lines of coherence 0 left out, the first at {lost[0]:g} Hz" if lost.size else ""
+    method = "; ".join(filter(None, (method, how, left_out)))
     return FrequencyResponse(
-        frequency_Hz[keep],
-        value[keep],
-        None,
-        None,
-        tuple(inputs),
-        tuple(outputs),
-        input_unit,
-        output_unit,
-        entry_variance=variance[keep],
-        method=method,
+        frequency[keep], value[keep], None, None, entry_variance=variance[keep], method=method, **labels
     )
+
+
+def _averages(fields: Mapping[str, Any], hints: Hints) -> float:
+    averages = hints.averages
+    if averages is None:
+        if fields.get("averages") is None:
+            raise InputError("missing; the errors follow from coherence and the number of averages", field="averages")
+        averages = as_number(fields["averages"], "averages")
+    if averages < 2:
+        message = "expected 2 or more; with one average the coherence is always 1"
+        raise InputError(message, field="averages", value=averages)
+    return averages
 
 
 def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
@@ -177,7 +139,7 @@ def _plain(array: np.ndarray, field: str, kinds: str) -> np.ndarray:
     return array
 
 
-def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | None) -> np.ndarray:
+def _coherence(coherence: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     coherence = _plain(coherence, "coherence", "fiu").astype(float)
     if coherence.shape == shape[:2] and shape[2] == 1:
         coherence = coherence[:, :, None]
@@ -192,9 +154,4 @@ def _coherence(coherence: np.ndarray, shape: tuple[int, ...], averages: float | 
     if np.any(coherence < 0) or np.any(coherence > 1 + SETTINGS.rounding):
         worst = coherence.flat[np.argmax(np.abs(coherence - 0.5))]
         raise InputError("expected values from 0 to 1", field="coherence", value=float(worst))
-    if averages is None:
-        raise InputError("missing; the errors follow from coherence and the number of averages", field="averages")
-    if not (np.isfinite(averages) and averages >= 2):
-        message = "expected 2 or more; with one average the coherence is always 1"
-        raise InputError(message, field="averages", value=averages)
     return np.minimum(coherence, 1.0)

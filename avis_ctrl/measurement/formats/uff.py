@@ -19,7 +19,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, RecordSource
 from avis_ctrl.measurement.formats.common import ALLOWED, INPUT_NAME, Unit, reading, require_small, unit_of
 from avis_ctrl.measurement.formats.records import Hints, Mapped, Part, campaign_from, mapped, pick, record_from
-from avis_ctrl.measurement.formats.response import response_from
+from avis_ctrl.measurement.formats.response import stated_response
 from avis_ctrl.measurement.formats.time_axis import agreed_rate, rounded, sample_rate_from
 from avis_ctrl.measurement.formats.uff_functions import Axis, Function, Point, functions
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
@@ -128,52 +128,49 @@ def _clock(function: Function) -> tuple[float, float, str]:
     return rate, float(time[0]), note if abs(rate * step - 1) > 1e-9 else ""
 
 
-def _inputs(first: Mapping[Point, Function], names: Mapping[Point, str]) -> list[str]:
-    """Channels that the file identifies as inputs."""
+def _inputs(first: Mapping[str, Function]) -> list[str]:
+    """Channels that the file identifies as inputs, from the first function of each."""
     references = {
         function.reference for function in first.values() if function.reference.node > 0 or function.reference.name
     }
     return [
-        names[point]
-        for point, function in first.items()
-        if function.axes[1].kind == FORCE or point in references or re.fullmatch(INPUT_NAME, names[point], re.I)
+        name
+        for name, function in first.items()
+        if function.axes[1].kind == FORCE or function.response in references or re.fullmatch(INPUT_NAME, name, re.I)
     ]
 
 
 def _campaign(path: Path, found: Sequence[Function], columns: Mapped | None, rig: str | None, hints: Hints) -> Campaign:
-    takes: dict[Point, list[Function]] = defaultdict(list)
-    for function in found:
-        if function.kind == TIME:
-            takes[function.response].append(function)
-    names = channel_names(list(takes))
-    points = {name: point for point, name in names.items()}
-    roles = _roles(takes, names, columns, hints)
-    count = max(len(functions_) for functions_ in takes.values())
+    responses = [function for function in found if function.kind == TIME]
+    names = channel_names([function.response for function in responses])
+    takes: dict[str, list[Function]] = defaultdict(list)
+    for function in responses:
+        takes[names[function.response]].append(function)
+    roles = _roles(takes, columns, hints)
+    count = max(map(len, takes.values()))
     others = sorted({function.kind for function in found} - {TIME})
     records, notes = [], [f"functions of type {other} beside the time responses were not read" for other in others]
     for k in range(count):
         chosen = {}
         for role, wanted in roles.items():
             for name in wanted:
-                if len(takes[points[name]]) <= k:
+                if len(takes[name]) <= k:
                     message = f"missing in record {k:02d}; other channels have {count} records"
                     raise InputError(message, field=f"channel {name}")
-            chosen[role] = [takes[points[name]][k] for name in wanted]
-        record, assumed = _record(f"{k:02d}", chosen, roles, hints)
+            chosen[role] = {name: takes[name][k] for name in wanted}
+        record, assumed = _record(f"{k:02d}", chosen, hints)
         records.append(record)
         notes += assumed
     return campaign_from(records, notes, rig or "", path)
 
 
-def _roles(
-    takes: Mapping[Point, list[Function]], names: Mapping[Point, str], columns: Mapped | None, hints: Hints
-) -> dict[str, list[str]]:
-    available = list(names.values())
+def _roles(takes: Mapping[str, list[Function]], columns: Mapped | None, hints: Hints) -> dict[str, list[str]]:
+    available = list(takes)
     roles = {role: mapped(columns, role) or [] for role in ("u", "y", "floor")}
     for role, wanted in roles.items():
         pick(wanted, available, role)
     if columns is None:
-        roles["u"] = _inputs({point: some[0] for point, some in takes.items()}, names)
+        roles["u"] = _inputs({name: some[0] for name, some in takes.items()})
         roles["floor"] = list(FLOOR_NAMES) if set(FLOOR_NAMES) <= set(available) else []
         roles["y"] = [name for name in available if name not in roles["u"] and name not in roles["floor"]]
     if not roles["u"] and hints.excitation not in ("rest", "floor"):
@@ -187,10 +184,9 @@ def _roles(
     return roles if roles["floor"] else {role: roles[role] for role in ("u", "y")}
 
 
-def _record(
-    name: str, chosen: Mapping[str, list[Function]], roles: Mapping[str, list[str]], hints: Hints
-) -> tuple[RecordSource, list[str]]:
-    every = [function for some in chosen.values() for function in some]
+def _record(name: str, chosen: Mapping[str, Mapping[str, Function]], hints: Hints) -> tuple[RecordSource, list[str]]:
+    """A record from the function of each channel, by role and name."""
+    every = [function for some in chosen.values() for function in some.values()]
     (rate, start, note), first, samples = _clock(every[0]), every[0].response.channel(), len(every[0].value)
     for function in every[1:]:
         field = f"record {name}, channel {function.response.channel()}"
@@ -199,7 +195,8 @@ def _record(
         if not np.allclose(function.abscissa, every[0].abscissa, rtol=0, atol=0.1 / rate):
             raise InputError(f"expected the times of {first}", field=field)
     parts = {}
-    for role, some in chosen.items():
+    for role, by_name in chosen.items():
+        some = by_name.values()
         hint = {"u": hints.u_unit, "y": hints.y_unit}.get(role)
         if any(np.iscomplexobj(function.value) for function in some):
             raise InputError("expected real samples of a time response", field=f"record {name}: {role}")
@@ -207,7 +204,7 @@ def _record(
         array = np.zeros((samples, len(some)))
         for column, function, unit in zip(array.T, some, units, strict=True):
             column[:] = function.value * unit.factor
-        parts[role] = Part(roles[role], [unit.si for unit in units], array)
+        parts[role] = Part(list(by_name), [unit.si for unit in units], array)
     # The units have already been applied.
     hints = replace(hints, u_unit=None, y_unit=None)
     if hints.sample_rate_Hz is not None:
@@ -251,18 +248,17 @@ def _response(found: Sequence[Function], hints: Hints) -> FrequencyResponse:
     if len(units) > 1:
         raise InputError("expected one unit of all frequency responses", field="units", value=sorted(units))
     output_unit, input_unit = units.pop()
-    averages = hints.averages if hints.averages is not None else _averages(found)
-    return response_from(
-        frequency,
-        value,
-        [input_names[u] for u in inputs],
-        [output_names[y] for y in outputs],
-        coherence=coherence if complete else None,
-        averages=averages,
-        input_unit=input_unit,
-        output_unit=output_unit,
-        relative_standard_deviation=hints.relative_standard_deviation,
-    )
+    fields = {
+        "frequency_Hz": frequency,
+        "value": value,
+        "coherence": coherence if complete else None,
+        "averages": _averages(found),
+        "inputs": [input_names[u] for u in inputs],
+        "outputs": [output_names[y] for y in outputs],
+        "input_unit": input_unit,
+        "output_unit": output_unit,
+    }
+    return stated_response(fields, replace(hints, u_unit=None, y_unit=None))  # the units have already been applied
 
 
 def _entries(found: Sequence[Function], kinds: Sequence[int]) -> dict[Entry, Function]:

@@ -79,13 +79,11 @@ def functions(path: Path) -> list[Function]:
     at, number = 0, 0
     found: list[Function] = []
     length = force = 1.0
-    while True:
+    while at < len(text):
         line, after = _line(text, at)
-        if not line.strip() and after < len(text):
+        if not line.strip():
             at = after
             continue
-        if after >= len(text) and not line.strip():
-            return found
         if line.strip() != MARK:
             shown = line[:40].decode("latin-1")
             raise InputError("expected a line '    -1' that opens a data set", field=f"byte {at}", value=shown)
@@ -100,6 +98,7 @@ def functions(path: Path) -> list[Function]:
         if kind == b"164":
             length, force = _units(text[body:end], place)
         at = _line(text, end)[1]
+    return found
 
 
 def _line(text: bytes, at: int) -> tuple[bytes, int]:

@@ -109,28 +109,31 @@ def _fit(
     reach: float,
     start: Resonance | None = None,
 ) -> Resonance:
-    f = response.frequency_Hz
-    use = np.flatnonzero(np.abs(f - centre) <= half)
+    use = np.flatnonzero(np.abs(response.frequency_Hz - centre) <= half)
     if use.size < SETTINGS.fewest_lines:
-        use = np.sort(np.argsort(np.abs(f - centre), kind="stable")[: SETTINGS.fewest_lines])
-    w, w0 = 2 * np.pi * f[use], 2 * np.pi * centre
-    scale = (w[-1] - w[0]) / 2
+        nearest = np.argsort(np.abs(response.frequency_Hz - centre), kind="stable")
+        use = np.sort(nearest[: SETTINGS.fewest_lines])
+    f, w0 = response.frequency_Hz[use], 2 * np.pi * centre
+    w, scale, band = 2 * np.pi * f, np.pi * (f[-1] - f[0]), f"from {f[0]:.6g} to {f[-1]:.6g} Hz"
     G = response.value[use].reshape(use.size, -1)
     variance = response.variance()[use].reshape(use.size, -1)
-    floor = np.finfo(float).eps * np.max(np.abs(G)) ** 2
-    weight = 1 / np.sqrt(np.maximum(variance, floor))
+    weight = 1 / np.sqrt(np.maximum(variance, np.finfo(float).eps * np.max(np.abs(G)) ** 2))
+    right = (weight * G).T[:, :, None]
+    background = np.stack([np.ones(w.size), (w - w0) / scale], axis=1)
 
-    def project(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (lines, entries) and coefficients (entries, 3) for a pole w0 + scale x0, decay scale exp(x1)."""
-        pole = -scale * np.exp(x[1]) + 1j * (w0 + scale * x[0])
-        basis = np.stack([scale / (1j * w - pole), np.ones(w.size), (w - w0) / scale], axis=1)
+    def project(basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (entries, lines) and coefficients (entries, k) of least squares with the columns (lines, k)."""
         q, r = np.linalg.qr(weight.T[:, :, None] * basis)
-        right = (weight * G).T[:, :, None]
         along = np.swapaxes(q.conj(), 1, 2) @ right
         return (right - q @ along)[:, :, 0], np.linalg.solve(r, along)[:, :, 0]
 
+    def basis(x: np.ndarray) -> np.ndarray:
+        """Columns for a pole w0 + scale x0 with the decay scale exp(x1)."""
+        pole = -scale * np.exp(x[1]) + 1j * (w0 + scale * x[0])
+        return np.column_stack([scale / (1j * w - pole), background])
+
     def stacked(x: np.ndarray) -> np.ndarray:
-        left = project(x)[0].ravel()
+        left = project(basis(x))[0].ravel()
         return np.concatenate([left.real, left.imag])
 
     decays = (0.03, 0.3) if start is None else (2 * np.pi * start.damping * start.frequency_Hz / scale,)
@@ -139,58 +142,24 @@ def _fit(
         for decay in decays
     ]
     best = min(fits, key=lambda s: s.cost)
-    free = 2 * (use.size - 3) * G.shape[1] - 2
-    _require_pole(best.cost, free, weight, G, w - w0, near_Hz, f[use])
-    # E|e|^2 counts real and imaginary parts, each of half the variance.
-    misfit = 2 * 2 * best.cost / free
-    residue = (scale * project(best.x)[1][:, 0]).reshape(response.value.shape[1:])
-    return _result(best.x, best.jac, residue, misfit, scale, w0, f[use], near_Hz, reach)
-
-
-def _require_pole(
-    with_pole: float, free: int, weight: np.ndarray, G: np.ndarray, d: np.ndarray, near_Hz: float, f: np.ndarray
-) -> None:
-    """F test of the pole against the background alone; with_pole : half the sum of squared residuals with it."""
-    q, _ = np.linalg.qr(weight.T[:, :, None] * np.stack([np.ones(d.size), d / np.abs(d).max()], axis=1))
-    right = (weight * G).T[:, :, None]
-    without = float(np.sum(np.abs(right - q @ (np.swapaxes(q, 1, 2) @ right)) ** 2) / 2)
-    added = 2 * G.shape[1] + 2
-    ratio = (without - with_pole) / added / max(with_pole / free, np.finfo(float).tiny)
+    # F test of the pole against the background alone.
+    added, free = 2 * G.shape[1] + 2, 2 * (use.size - 3) * G.shape[1] - 2
+    without = float(np.sum(np.abs(project(background)[0]) ** 2) / 2)
+    ratio = (without - best.cost) / added / max(best.cost / free, np.finfo(float).tiny)
     limit = float(stats.f(added, free).isf(SETTINGS.false_alarm))
     if ratio < limit:
-        raise ComputationError(
-            f"no mode found near {near_Hz:g} Hz",
-            measured=f"a pole explains {ratio:.3g} times as much as of pure noise, from {f[0]:.6g} "
-            f"to {f[-1]:.6g} Hz; {limit:.3g} is needed",
-            cause="no resonance there, or one hidden by noise",
-            next_step="look at the response, and give near_Hz at a peak",
-        )
-
-
-def _result(
-    x: np.ndarray,
-    J: np.ndarray,
-    residue: np.ndarray,
-    misfit: float,
-    scale: float,
-    w0: float,
-    f: np.ndarray,
-    near_Hz: float,
-    reach: float,
-) -> Resonance:
-    """The mode, with standard deviations from the Jacobian J of the residuals with respect to x."""
-    decay, turn = scale * np.exp(x[1]), w0 + scale * x[0]
-    natural = np.hypot(decay, turn)
-    if abs(natural / (2 * np.pi) - near_Hz) > 2 * reach or abs(x[0]) >= 1.5 or x[1] >= 3.0 or x[1] <= -14.0:
-        raise ComputationError(
-            f"no mode found near {near_Hz:g} Hz",
-            measured=f"the fit ended at {natural / (2 * np.pi):.6g} Hz with damping "
-            f"{decay / natural:.3g} over {f[0]:.6g} to {f[-1]:.6g} Hz",
-            cause="no resonance there, or one too broad or too close to another for a local fit",
-            next_step="look at the response, and give near_Hz at a single peak",
-        )
-    # The rows of J are scaled to variance 1/2.
-    covariance = np.linalg.inv(2 * J.T @ J) * max(misfit, 1.0)
+        measured = f"a pole explains {ratio:.3g} times as much as of pure noise, {band}; {limit:.3g} is needed"
+        raise _no_mode(near_Hz, measured, "hidden by noise", "a peak")
+    decay, turn = scale * np.exp(best.x[1]), w0 + scale * best.x[0]
+    natural = float(np.hypot(decay, turn))
+    found_Hz, damping = natural / (2 * np.pi), decay / natural
+    if abs(found_Hz - near_Hz) > 2 * reach or abs(best.x[0]) >= 1.5 or best.x[1] >= 3.0 or best.x[1] <= -14.0:
+        measured = f"the fit ended at {found_Hz:.6g} Hz with damping {damping:.3g}, {band}"
+        raise _no_mode(near_Hz, measured, "too broad or too close to another for a local fit", "a single peak")
+    # E|e|^2 counts real and imaginary parts, each of half the variance.
+    misfit = 2 * 2 * best.cost / free
+    # The rows of the Jacobian are scaled to variance 1/2.
+    covariance = np.linalg.inv(2 * best.jac.T @ best.jac) * max(misfit, 1.0)
     # Derivatives of natural and damping with respect to x: natural^2 = decay^2 + turn^2, damping = decay / natural.
     by_x = np.array(
         [
@@ -199,13 +168,15 @@ def _result(
         ]
     )
     spread = np.sqrt(np.diag(by_x @ covariance @ by_x.T))
-    return Resonance(
-        natural / (2 * np.pi),
-        decay / natural,
-        spread[0] / (2 * np.pi),
-        spread[1],
-        residue,
-        float(misfit),
-        (float(f[0]), float(f[-1])),
-        f.size,
+    residue = (scale * project(basis(best.x))[1][:, 0]).reshape(response.value.shape[1:])
+    ends = float(f[0]), float(f[-1])
+    return Resonance(found_Hz, damping, spread[0] / (2 * np.pi), spread[1], residue, float(misfit), ends, f.size)
+
+
+def _no_mode(near_Hz: float, measured: str, one: str, at: str) -> ComputationError:
+    return ComputationError(
+        f"no mode found near {near_Hz:g} Hz",
+        measured=measured,
+        cause=f"no resonance there, or one {one}",
+        next_step=f"look at the response, and give near_Hz at {at}",
     )

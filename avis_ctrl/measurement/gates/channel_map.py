@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.channel_faults import Faults, ModelComparison, compare, cycle_of, explain
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Response, Series, Severity, quoted
-from avis_ctrl.measurement.gates.h1 import Spectra, directions, segment_length, spectra, usable
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Response, Series, Severity, bars, quoted, those
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, directions, segment_length, usable
 
 ORDER, POLARITY = "channel order", "polarity"  # gate names of the findings
 
@@ -36,15 +36,12 @@ COPIES = CopySettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """u (samples, n_u), y and the model's y (samples, n_y) of a driven record; wrap: they are one period."""
+    """Copies in a record; of a driven one the samples, and the same with the model's y."""
 
     record: str
     copies: list[tuple[int, int, float, float]]
-    rate: float = 0.0
-    wrap: bool = False
-    u: np.ndarray | None = None
-    y: np.ndarray | None = None
-    model: np.ndarray | None = None
+    measured: Samples | None = None
+    model: Samples | None = None
 
 
 class ChannelMap(Gate):
@@ -63,46 +60,37 @@ class ChannelMap(Gate):
 
     name = "channel map"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         copies = _copies(seen)
-        if not seen.driven or expectation.response is None:
+        if not seen.driven or self.expectation.response is None:
             return _Kept(seen.header.name, copies)
-        u, y, wrap = usable(seen)
-        rate = seen.header.sample_rate_Hz
-        model = predicted(expectation.response, u, rate, seen.header.u_names, wrap)
-        order = _order(seen.header.y_names, expectation.y_names, model.shape[1])
-        return _Kept(seen.header.name, copies, rate, wrap, u, y, None if order is None else model[:, order])
+        measured = usable(seen)
+        y = predicted(self.expectation.response, measured, seen.header.u_names)
+        order = _order(seen.header.y_names, self.expectation.y_names, y.shape[1])
+        return _Kept(seen.header.name, copies, measured, None if order is None else replace(measured, y=y[:, order]))
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         def response(f: np.ndarray) -> np.ndarray:
-            assert expectation.response is not None
-            G = expectation.response(2 * np.pi * f, campaign.u_names)
-            return G[:, _order(campaign.y_names, expectation.y_names, G.shape[1])]
+            assert self.expectation.response is not None
+            G = self.expectation.response(2 * np.pi * f, self.campaign.u_names)
+            return G[:, _order(self.campaign.y_names, self.expectation.y_names, G.shape[1])]
 
-        copied, comparison = list(_copied(kept, campaign)), compare(_pairs(kept), response)
+        copied, comparison = list(_copied(kept, self.campaign)), compare(_pairs(kept), response)
         if comparison is None:
-            if expectation.response is None:
-                return _not_compared(kept, copied, campaign, "no model was given", "ok")
-            return _not_compared(kept, copied, campaign, "too few driven samples", "note")
-        faults, least = explain(comparison), comparison.settings.least_agreement
-        order_picture = _order_picture(faults, campaign, comparison)
-        sign_picture = _sign_picture(faults, campaign, least)
-        order = copied + list(_exchanged(faults, campaign, least, order_picture))
-        signs = list(_flipped(faults, campaign, comparison, sign_picture))
-        return [
-            *(order or [_right(faults, campaign, comparison, order_picture)]),
-            *(signs or [_signs_agree(faults, least, sign_picture)]),
-        ]
+            if self.expectation.response is None:
+                return _not_compared(kept, copied, "no model was given", "ok")
+            return _not_compared(kept, copied, "too few driven samples", "note")
+        faults = explain(comparison)
+        picture = _order_picture(faults, self.campaign, comparison)
+        order = [*copied, *_exchanged(faults, self.campaign, comparison.settings.least_agreement, picture)]
+        order = order or [_right(faults, self.campaign, comparison, picture)]
+        return [*order, *_polarity(faults, self.campaign, comparison)]
 
 
-def _not_compared(
-    kept: list[_Kept], copied: list[Finding], campaign: Campaign, why: str, severity: Severity
-) -> list[Finding]:
-    none = Series("not known", np.arange(len(campaign.y_names)), np.zeros(len(campaign.y_names)), "points")
-    picture = Picture("Polarity of each sensor", "sensor number", "correlation [-]", (none,))
+def _not_compared(kept: list[_Kept], copied: list[Finding], why: str, severity: Severity) -> list[Finding]:
     sentence = f"No channel is a copy of another; their order was not compared with a model ({why})."
     order = copied or [Finding(ORDER, severity, sentence, picture=_copy_picture(kept))]
-    return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).", picture=picture)]
+    return [*order, Finding(POLARITY, severity, f"Polarity was not compared with a model ({why}).")]
 
 
 def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
@@ -112,7 +100,8 @@ def _copied(kept: list[_Kept], campaign: Campaign) -> Iterator[Finding]:
         _, scale, rest = hits[0]
         if len(hits) < len(kept) or any(abs(s - scale) > 2 * COPIES.different * abs(scale) for _, s, _ in hits):
             continue
-        alike = all(of.model is not None and _difference(of.model[:, i], of.model[:, k]) < COPIES.alike for of in kept)
+        models = [of.model for of in kept]
+        alike = all(m is not None and _difference(m.y[:, i], m.y[:, k]) < COPIES.alike for m in models)
         severity: Severity = "note" if alike else "stop"
         cause = (
             "the model expects that of these records, so they do not show whether one signal was recorded twice. "
@@ -159,7 +148,7 @@ def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison, pict
     worst, enough = int(np.argmin(faults.other)), comparison.settings.least_agreement
     lowest = float(faults.other[worst])
     least = f"the lowest correlation is {lowest:.2f}, of {campaign.y_names[worst]!r}"
-    alone = tuple(campaign.y_names[k] for k in np.flatnonzero(faults.other < enough))
+    alone = those(campaign.y_names, faults.other < enough)
     severity: Severity = "ok"
     channels: tuple[str, ...] = ()
     if faults.doubtful:
@@ -197,8 +186,18 @@ def _order_picture(faults: Faults, campaign: Campaign, comparison: ModelComparis
     )
 
 
-def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison, picture: Picture) -> Iterator[Finding]:
+def _polarity(faults: Faults, campaign: Campaign, comparison: ModelComparison) -> Iterator[Finding]:
+    """Flipped sensors and drives, or that there are none."""
+    least, lowest = comparison.settings.least_agreement, float(faults.other.min())
+    heights, limit = dict(zip(campaign.y_names, faults.r * faults.other, strict=True)), Limit("opposite sign", -least)
+    picture = bars("Signed correlation with the model", "sensor", "correlation [-]", heights, (limit,))
     rows, columns = ([int(k) for k in np.flatnonzero(signs < 0)] for signs in (faults.r, faults.c))
+    if faults.doubtful:
+        sentence = "The signs could not be checked: the agreement of model and records is too poor."
+        yield Finding(POLARITY, "note", sentence, value=lowest, limit=least, picture=picture)
+    elif not rows and not columns:
+        sentence = f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f})."
+        yield Finding(POLARITY, "ok", sentence, value=lowest, limit=least, picture=picture)
     either = 2 * (len(rows) + len(columns)) == len(faults.r) + np.count_nonzero(comparison.moving)
     doubt = " It is equally possible that all other channels are reversed." if either else ""
     said = []
@@ -216,60 +215,38 @@ def _flipped(faults: Faults, campaign: Campaign, comparison: ModelComparison, pi
             "exchanged, or the model's axis has the opposite direction. Exchange the leads or reverse the sign of the "
             f"channel.{doubt}"
         )
-        limit = -comparison.settings.least_agreement
-        yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=limit, picture=picture)
+        yield Finding(POLARITY, "stop", sentence, (name,), value=value, limit=-least, picture=picture)
 
 
-def _signs_agree(faults: Faults, least: float, picture: Picture) -> Finding:
-    lowest = float(faults.other.min())
-    severity: Severity = "note" if faults.doubtful else "ok"
-    sentence = (
-        "The signs could not be checked: the agreement of model and records is too poor."
-        if faults.doubtful
-        else f"All signs agree with the model (lowest correlation of a sensor {lowest:.2f})."
-    )
-    return Finding(POLARITY, severity, sentence, value=lowest, limit=least, picture=picture)
-
-
-def _sign_picture(faults: Faults, campaign: Campaign, least: float) -> Picture:
-    return Picture(
-        "Signed correlation with the model",
-        "sensor",
-        "correlation [-]",
-        (Series("sensors", np.arange(len(faults.r)), faults.r * faults.other, "bars"),),
-        (Limit("opposite sign", -least),),
-        x_names=campaign.y_names,
-    )
-
-
-def predicted(response: Response, u: np.ndarray, rate: float, inputs: tuple[str, ...], wrap: bool) -> np.ndarray:
-    """(samples, n_y) y of the model, starting from rest; periodic if `wrap`."""
-    n = len(u) if wrap else 2 * len(u)
-    f = np.fft.rfftfreq(n, 1 / rate)
-    U = np.fft.rfft(u, n, axis=0)
+def predicted(response: Response, measured: Samples, inputs: tuple[str, ...]) -> np.ndarray:
+    """(samples, n_y) y of the model, starting from rest; periodic if the samples wrap."""
+    samples = len(measured.u)
+    n = samples if measured.wrap else 2 * samples
+    f = np.fft.rfftfreq(n, 1 / measured.rate_Hz)
+    U = np.fft.rfft(measured.u, n, axis=0)
     # The model's response is not needed on lines 60 dB below the largest.
     power = np.sum(np.abs(U) ** 2, axis=1)
     keep = power > 1e-6 * power.max(initial=0.0)
     keep[0] = False
     if not keep.any():
-        return np.zeros((len(u), 0))
+        return np.zeros((samples, 0))
     G = response(2 * np.pi * f[keep], inputs)
     Y = np.zeros((len(f), G.shape[1]), complex)
     Y[keep] = np.einsum("fij,fj->fi", G, U[keep])
-    return np.fft.irfft(Y, n, axis=0)[: len(u)]
+    return np.fft.irfft(Y, n, axis=0)[:samples]
 
 
 def _pairs(kept: list[_Kept]) -> list[tuple[Spectra, Spectra]]:
     """Measured and expected spectra, with the longest segments that all records together allow: records that drive one
     axis after the other are short, but many.
     """
-    held = [(k, k.u, k.y, k.model) for k in kept if k.u is not None and k.y is not None and k.model is not None]
+    held = [(k.measured, k.model) for k in kept if k.measured is not None and k.model is not None]
     if not held:
         return []
-    rank = directions(np.concatenate([u - u.mean(axis=0) for _, u, _, _ in held])).shape[1]
-    shortest, samples = min(len(u) for _, u, _, _ in held), sum(len(u) for _, u, _, _ in held)
-    length = min(segment_length(samples, rank), 1 << int(np.log2(max(16, shortest))))
-    return [(spectra(u, y, k.rate, length, k.wrap), spectra(u, m, k.rate, length, k.wrap)) for k, u, y, m in held]
+    rank = directions(np.concatenate([one.u - one.u.mean(axis=0) for one, _ in held])).shape[1]
+    samples = [len(one.u) for one, _ in held]
+    length = min(segment_length(sum(samples), rank), 1 << int(np.log2(max(16, min(samples)))))
+    return [(one.spectra(length), model.spectra(length)) for one, model in held]
 
 
 def _order(names: tuple[str, ...], expected: tuple[str, ...] | None, rows: int) -> list[int] | None:

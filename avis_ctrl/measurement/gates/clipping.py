@@ -8,19 +8,9 @@ from itertools import pairwise
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    quoted,
-    samples_over_time,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Severity, bars, quoted, samples_over_time
 
 # The top code of a noise-free sine occurs up to 2.42 times as often as the next code.
 SINE_TOP = 2.42
@@ -83,50 +73,49 @@ class Clipping(Gate):
 
     name = "clipping"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> list[_Ends]:
+    def look(self, seen: Excerpt) -> list[_Ends]:
         h = seen.header
         u = np.concatenate([p.u for p in seen.pieces])
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - h.start_s
         periods, ends = max(1, h.periods), []
         for k, name in enumerate(h.u_names):
-            limit = expectation.drive_limits_V.get(name)
+            limit = self.expectation.drive_limits_V.get(name)
             bounds = (-limit, limit) if limit else None
             ends.append(_ends(h.name, name, t, u[:, k], bounds, 2e-9 * limit if limit else None, free=False))
         for k, name in enumerate(h.y_names):
-            ends.append(_ends(h.name, name, t, y[:, k], expectation.y_range_V, expectation.y_lsb_V, True, periods))
+            ends.append(
+                _ends(h.name, name, t, y[:, k], self.expectation.y_range_V, self.expectation.y_lsb_V, True, periods)
+            )
         return ends
 
-    def conclude(self, kept: list[list[_Ends]], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[list[_Ends]]) -> list[Finding]:
         rows = [row for rows in kept for row in rows]
         level = FINDING.false_alarm / (2 * len(rows))
         wrong = [row for row in rows if row.unit]
         names = tuple(dict.fromkeys(row.channel for row in wrong))
-        found = [self._unit(wrong, names, expectation, campaign)] if wrong else []
+        found = [self._unit(wrong, names)] if wrong else []
         bad = [row for row in rows if row.count and row.p < level and row.channel not in names]
         found += [
             self._finding([row for row in bad if row.channel == channel])
             for channel in dict.fromkeys(row.channel for row in bad)
         ]
-        peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*campaign.u_names, *campaign.y_names)}
+        peaks = {
+            n: max(r.peak for r in rows if r.channel == n) for n in (*self.campaign.u_names, *self.campaign.y_names)
+        }
         top = max(peaks, key=lambda n: peaks[n])
-        end = None if expectation.y_range_V is None else expectation.y_range_V[1]
-        picture = Picture(
-            "Largest absolute value of each channel",
-            "channel",
-            f"largest value [{campaign.y_unit}]",
-            (Series("peak", np.arange(len(peaks)), np.array(list(peaks.values())), "bars"),),
-            () if end is None else (Limit("converter", end),),
-            x_names=tuple(peaks),
-        )
+        end = None if self.expectation.y_range_V is None else self.expectation.y_range_V[1]
+        limits = () if end is None else (Limit("converter", end),)
+        label = f"largest value [{self.campaign.y_unit}]"
+        picture = bars("Largest absolute value of each channel", "channel", label, peaks, limits)
         sentence = f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}."
         return found or [Finding(self.name, "ok", sentence, value=peaks[top], limit=end, picture=picture)]
 
-    def _unit(self, rows: list[_Ends], names: tuple[str, ...], expectation: Expectation, campaign: Campaign) -> Finding:
+    def _unit(self, rows: list[_Ends], names: tuple[str, ...]) -> Finding:
         """Finding for records with most samples at or beyond the range."""
-        row, unit = max(rows, key=lambda r: r.count), campaign.y_unit
-        assert expectation.y_range_V is not None
-        end, part = expectation.y_range_V[1], row.count / row.samples
+        row, unit = max(rows, key=lambda r: r.count), self.campaign.y_unit
+        assert self.expectation.y_range_V is not None
+        end, part = self.expectation.y_range_V[1], row.count / row.samples
         sentence = (
             f"{100 * part:.0f} % of the samples of channel {row.channel!r} of record {row.record} are at or beyond the "
             f"converter's range, which ends at {end:.6g} {unit}; the largest is {row.peak:.6g}. Channels concerned: "

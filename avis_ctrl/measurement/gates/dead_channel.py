@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, quoted, samples_over_time
-from avis_ctrl.measurement.gates.h1 import h1, moving, record_spectra, usable
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, curves, quoted, samples_over_time
+from avis_ctrl.measurement.gates.h1 import h1, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 
@@ -32,14 +32,14 @@ SETTINGS = DeadSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
-    """Data of one record; stuck : length and start of a stuck run, and t [s] and y around it, by channel."""
+    """Data of one record; stuck : finding on a stuck run, by channel."""
 
     record: str
     driven: bool
     rms: np.ndarray
     spread: np.ndarray
     codes: np.ndarray
-    stuck: dict[int, tuple[int, int, np.ndarray, np.ndarray]]
+    stuck: dict[int, Finding]
     response: np.ndarray | None
 
 
@@ -55,7 +55,7 @@ class DeadChannel(Gate):
 
     name = "dead channel"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         y = np.concatenate([p.y for p in seen.pieces])
         t = np.concatenate([p.time for p in seen.pieces]) - seen.header.start_s
         stuck = {}
@@ -63,37 +63,36 @@ class DeadChannel(Gate):
             runs = equal_runs(y[:, k])
             (longest, at), second = runs[0], runs[1][0] if len(runs) > 1 else 1
             if max(SETTINGS.stuck_samples, SETTINGS.stuck_factor * second) <= longest < len(y):
-                part = slice(max(0, at - longest), at + 2 * longest)
-                stuck[k] = longest, at, t[part], y[part, k]
+                stuck[k] = self._stuck(seen.header, k, t, y[:, k], longest, at)
         codes = np.array([len(np.unique(y[: 1 << 14, k])) for k in range(y.shape[1])])
         rms = np.where(np.ptp(y, axis=0) > 0, y.std(axis=0), 0.0)
         spread = np.ptp(np.concatenate([p.u for p in seen.pieces]), axis=0)
         return _Kept(seen.header.name, seen.driven, rms, spread, codes, stuck, _excess(seen))
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         rms = np.array([k.rms for k in kept])
         picture = Picture(
             "R.m.s. of each channel by record",
             "record number",
-            f"r.m.s. [{campaign.y_unit}]",
-            curves(campaign.y_names, np.arange(len(kept)), rms, "points"),
+            f"r.m.s. [{self.campaign.y_unit}]",
+            curves(self.campaign.y_names, np.arange(len(kept)), rms, "points"),
             y_scale="log",
         )
-        found = [*self._sensors(kept, campaign, rms, picture), *self._never_driven(kept, campaign, picture)]
+        found = [*self._sensors(kept, rms, picture), *self._never_driven(kept, picture)]
         strongest = rms.max(axis=0)
-        least, name = strongest.min(), campaign.y_names[int(np.argmin(strongest))]
+        least, name = strongest.min(), self.campaign.y_names[int(np.argmin(strongest))]
         sentence = (
-            f"All {len(strongest)} channels move; the quietest is {name!r} with {least:.3g} {campaign.y_unit} r.m.s. "
-            "in its strongest record."
+            f"All {len(strongest)} channels move; the quietest is {name!r} with {least:.3g} {self.campaign.y_unit} "
+            "r.m.s. in its strongest record."
         )
         return found or [Finding(self.name, "ok", sentence, value=least, limit=0.0, picture=picture)]
 
-    def _sensors(self, kept: list[_Kept], campaign: Campaign, rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
+    def _sensors(self, kept: list[_Kept], rms: np.ndarray, picture: Picture) -> Iterator[Finding]:
         driven = {k.record: k.response for k in kept if k.response is not None}
         # Drift looks like a slow sine: for sine records the median is used.
-        sines = all(record.header.excitation == "sine" for record in campaign.records)
+        sines = all(record.header.excitation == "sine" for record in self.campaign.records)
         excess = (np.median if sines else np.max)(list(driven.values()), axis=0) if driven else None
-        for j, name in enumerate(campaign.y_names):
+        for j, name in enumerate(self.campaign.y_names):
             dead = tuple(k.record for k in kept if k.rms[j] == 0)
             if dead:
                 where = "every record" if len(dead) == len(kept) else f"record {', '.join(dead[:5])}"
@@ -102,12 +101,10 @@ class DeadChannel(Gate):
                     "cable and input, or leave the channel out."
                 )
                 yield Finding(self.name, "stop", sentence, (name,), dead, 0.0, 0.0, picture)
-            for k in kept:
-                if j in k.stuck:
-                    yield self._stuck(name, j, k, campaign)
+            yield from (k.stuck[j] for k in kept if j in k.stuck)
             if not dead and excess is not None and excess[j] < 1 and np.median(excess) > SETTINGS.responds:
                 sentence = (
-                    f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {campaign.y_unit} r.m.s. "
+                    f"Channel {name!r} contains only noise of {np.median(rms[:, j]):.3g} {self.campaign.y_unit} r.m.s. "
                     f"({int(np.median([k.codes[j] for k in kept]))} different values) in every driven record while the "
                     f"other channels respond (its ratio of response to noise is {excess[j]:.2g} times the limit for "
                     f"noise alone; the median of all channels is {np.median(excess):.3g} times it): not connected, or "
@@ -115,9 +112,9 @@ class DeadChannel(Gate):
                 )
                 yield Finding(self.name, "stop", sentence, (name,), tuple(driven), excess[j], 1.0, picture)
 
-    def _never_driven(self, kept: list[_Kept], campaign: Campaign, picture: Picture) -> Iterator[Finding]:
+    def _never_driven(self, kept: list[_Kept], picture: Picture) -> Iterator[Finding]:
         driven = [k.spread for k in kept if k.driven]
-        idle = tuple(n for j, n in enumerate(campaign.u_names) if not any(spread[j] > 0 for spread in driven))
+        idle = tuple(n for j, n in enumerate(self.campaign.u_names) if not any(spread[j] > 0 for spread in driven))
         if driven and idle:
             sentence = (
                 f"Input {quoted(idle)} is constant in every driven record: its effect cannot be determined. Drive it "
@@ -125,15 +122,21 @@ class DeadChannel(Gate):
             )
             yield Finding(self.name, "note", sentence, idle, picture=picture)
 
-    def _stuck(self, name: str, j: int, kept: _Kept, campaign: Campaign) -> Finding:
-        (n, at, t, x), rate = kept.stuck[j], campaign.sample_rate_Hz
+    def _stuck(self, header: RecordHeader, k: int, t: np.ndarray, x: np.ndarray, n: int, at: int) -> Finding:
+        """Finding on channel k with n equal samples from x[at] on."""
+        name, record, rate, part = (
+            header.y_names[k],
+            header.name,
+            header.sample_rate_Hz,
+            slice(max(0, at - n), at + 2 * n),
+        )
         limit = Limit("stuck from", at / rate, "x")
-        picture = samples_over_time(kept.record, name, t, x, campaign.y_unit, (limit,))
+        picture = samples_over_time(record, name, t[part], x[part], header.y_unit, (limit,))
         sentence = (
-            f"Channel {name!r} of record {kept.record} repeats one value for {n} samples ({n / rate:.3g} s) from "
+            f"Channel {name!r} of record {record} repeats one value for {n} samples ({n / rate:.3g} s) from "
             f"{at / rate:.4g} s on: the converter or the data link was stuck. Leave that part out or repeat the record."
         )
-        return Finding(self.name, "warning", sentence, (name,), (kept.record,), n, SETTINGS.stuck_samples, picture)
+        return Finding(self.name, "warning", sentence, (name,), (record,), n, SETTINGS.stuck_samples, picture)
 
 
 def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
@@ -150,8 +153,8 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
         return None
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
-    u, y, wrap = usable(seen)
-    if not moving(u) or (estimate := h1([record_spectra(u, y, wrap, seen.header.sample_rate_Hz)])) is None:
+    samples = usable(seen)
+    if not samples.moving or (estimate := h1([samples.spectra()])) is None:
         return None
     limit = stats.beta.isf(FINDING.false_alarm / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)

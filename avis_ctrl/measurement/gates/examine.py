@@ -57,7 +57,7 @@ def examine(
     InputError : records that cannot be read.
     """
     known = expectation or Expectation()
-    gates = [gate() for gate in GATES]
+    gates = [gate(campaign, known) for gate in GATES]
     kept: list[list[Any]] = [[] for _ in gates]
     shortened = []
     for record in campaign.records:
@@ -65,8 +65,8 @@ def examine(
         if not seen.whole:
             shortened.append(seen.header.name)
         for gate, of in zip(gates, kept, strict=True):
-            of.append(gate.look(seen, known))
-    findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of, campaign, known)]
+            of.append(gate.look(seen))
+    findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of)]
     findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
     if shortened:
         said = (

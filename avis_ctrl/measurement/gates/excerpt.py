@@ -77,14 +77,17 @@ def excerpt(record: RecordSource, longest: int = SETTINGS.longest) -> Excerpt:
 
 
 class Gate(ABC):
-    """One check of a campaign: `look` at each record once, then `conclude`."""
+    """One check of a campaign: `look` at each record once, then `conclude`. expectation : what is known of the rig."""
 
     name: ClassVar[str]
 
+    def __init__(self, campaign: Campaign, expectation: Expectation):
+        self.campaign, self.expectation = campaign, expectation
+
     @abstractmethod
-    def look(self, seen: Excerpt, expectation: Expectation) -> Any:
+    def look(self, seen: Excerpt) -> Any:
         """What `conclude` needs of a record; small."""
 
     @abstractmethod
-    def conclude(self, kept: list[Any], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[Any]) -> list[Finding]:
         """At least one finding."""

@@ -91,12 +91,25 @@ def over_frequency(
     return Picture(title, "frequency [Hz]", y_label, series, limits, "log", y_scale)
 
 
+def bars(
+    title: str,
+    x_label: str,
+    y_label: str,
+    heights: Mapping[str, float],
+    limits: tuple[Limit, ...] = (),
+    y_scale: str = "linear",
+) -> Picture:
+    """A bar for each name."""
+    series = Series("value", np.arange(len(heights)), np.array(list(heights.values())), "bars")
+    return Picture(title, x_label, y_label, (series,), limits, y_scale=y_scale, x_names=tuple(heights))
+
+
 def samples_over_time(
     record: str, channel: str, t: np.ndarray, x: np.ndarray, unit: str = "", limits: tuple[Limit, ...] = ()
 ) -> Picture:
-    """Samples x (n,) of one channel at t (n,) s."""
+    """Samples x (n,) of one channel at t (n,) s, copied: a view would keep the whole record in memory."""
     label = f"{channel} [{unit}]" if unit else channel
-    return Picture(f"Record {record}, {channel}", "time [s]", label, (Series(channel, t, x),), limits)
+    return Picture(f"Record {record}, {channel}", "time [s]", label, (Series(channel, t.copy(), x.copy()),), limits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +170,11 @@ class Expectation:
         # Zero, which a rig file of a simulated table may state, is nothing to compare with.
         if self.sensor_noise_rms_V is not None and not self.sensor_noise_rms_V > 0:
             raise InputError("expected a positive number", field="sensor_noise_rms_V", value=self.sensor_noise_rms_V)
+
+
+def those(names: Sequence[str], chosen: np.ndarray) -> tuple[str, ...]:
+    """The names that a mask chooses."""
+    return tuple(name for name, yes in zip(names, chosen, strict=True) if yes)
 
 
 def quoted(names: Sequence[str]) -> str:

@@ -100,46 +100,55 @@ def driven_lines(power: np.ndarray) -> np.ndarray:
     return power > SETTINGS.driven * np.max(power, initial=0.0)
 
 
-def usable(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, bool]:
-    """u, y, and whether they wrap around: the mean period after the first, or the start of the record."""
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """u (samples, n_u) and y (samples, n_y) of a record at rate_Hz; wrap : they are one period, which repeats."""
+
+    u: np.ndarray
+    y: np.ndarray
+    rate_Hz: float
+    wrap: bool = False
+
+    @property
+    def moving(self) -> int:
+        """Number of inputs that are not constant."""
+        return int(np.count_nonzero(np.ptp(self.u, axis=0)))
+
+    def spectra(self, length: int | None = None) -> Spectra:
+        """Spectra of half-overlapping Hann segments, of `segment_length` by default; none if there are fewer samples
+        than in one.
+        """
+        size = segment_length(len(self.u), self.moving) if length is None else length
+        window = signal.get_window("hann", size)
+        scale = np.sqrt(2 / (self.rate_Hz * np.sum(window**2)))
+
+        def cut(a: np.ndarray) -> np.ndarray:
+            a = np.concatenate([a, a[: size // 2]]) if self.wrap else a
+            if len(a) < size:
+                return np.zeros((0, size // 2 + 1, a.shape[1]), complex)
+            parts = np.lib.stride_tricks.sliding_window_view(a, size, axis=0)[:: size // 2]
+            parts = parts - parts.mean(axis=-1, keepdims=True)
+            return scale * np.moveaxis(np.fft.rfft(parts * window), -1, 1)
+
+        return Spectra(np.fft.rfftfreq(size, 1 / self.rate_Hz), cut(self.u), cut(self.y))
+
+
+def usable(seen: Excerpt) -> Samples:
+    """The mean period after the first, or the start of the record."""
+    rate_Hz = seen.header.sample_rate_Hz
     if seen.periodic:
         u, y = seen.periods("u"), seen.periods("y")
         if u.shape[1] <= SETTINGS.most_samples:
-            return u[1:].mean(axis=0), y[1:].mean(axis=0), True
-    return seen.first.u[: SETTINGS.most_samples], seen.first.y[: SETTINGS.most_samples], False
-
-
-def moving(u: np.ndarray) -> int:
-    """Number of the columns of u (samples, n_u) that are not constant."""
-    return int(np.count_nonzero(np.ptp(u, axis=0)))
+            return Samples(u[1:].mean(axis=0), y[1:].mean(axis=0), rate_Hz, True)
+    # Copies: a view would keep the whole record in memory.
+    u, y = (array[: SETTINGS.most_samples].copy() for array in (seen.first.u, seen.first.y))
+    return Samples(u, y, rate_Hz)
 
 
 def segment_length(samples: int, inputs: int) -> int:
     """Segment length, a power of two, with at least 6 segments for each input and 24 in total at half overlap."""
     wanted = max(24, 6 * inputs)
     return max(16, 1 << int(np.log2(max(16.0, 2 * samples / (wanted + 1)))))
-
-
-def spectra(u: np.ndarray, y: np.ndarray, rate_Hz: float, length: int, wrap: bool) -> Spectra:
-    """Spectra of half-overlapping Hann segments; no segments if the record is shorter than one."""
-    if wrap:
-        u, y = (np.concatenate([a, a[: length // 2]]) for a in (u, y))
-    window = signal.get_window("hann", length)
-    scale = np.sqrt(2 / (rate_Hz * np.sum(window**2)))
-
-    def cut(a: np.ndarray) -> np.ndarray:
-        if len(a) < length:
-            return np.zeros((0, length // 2 + 1, a.shape[1]), complex)
-        parts = np.lib.stride_tricks.sliding_window_view(a, length, axis=0)[:: length // 2]
-        parts = parts - parts.mean(axis=-1, keepdims=True)
-        return scale * np.moveaxis(np.fft.rfft(parts * window), -1, 1)
-
-    return Spectra(np.fft.rfftfreq(length, 1 / rate_Hz), cut(u), cut(y))
-
-
-def record_spectra(u: np.ndarray, y: np.ndarray, wrap: bool, rate_Hz: float) -> Spectra:
-    """Spectra of the samples from `usable`, in segments of `segment_length`."""
-    return spectra(u, y, rate_Hz, segment_length(len(u), moving(u)), wrap)
 
 
 def directions(U: np.ndarray) -> np.ndarray:

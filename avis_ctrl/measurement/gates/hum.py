@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import signal, stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, Severity, over_frequency
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series, Severity, over_frequency
 from avis_ctrl.measurement.gates.h1 import driven_lines
 
 MAINS_HZ = (50.0, 60.0)
@@ -71,7 +70,7 @@ class Hum(Gate):
 
     name = "hum"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         h = seen.header
         y, u = seen.first.y, seen.first.u
         length = _length(len(y), h.sample_rate_Hz)
@@ -87,23 +86,23 @@ class Hum(Gate):
                 passed += made is None
         return _Kept(h.name, lines, passed, y.std(axis=0), f, np.sqrt(P))
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         tested, passed = sum(len(k.lines) for k in kept), sum(k.passed_over for k in kept)
         hits: dict[tuple[int, float], list[tuple[_Kept, _Line]]] = {}
         for k in kept:
             for line in k.lines:
                 if line.p < FINDING.false_alarm / tested and line.ratio > SETTINGS.least_ratio:
                     hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
-        found = [self._finding(campaign, mains, some) for (_, mains), some in sorted(hits.items())]
+        found = [self._finding(mains, some) for (_, mains), some in sorted(hits.items())]
         note = f"; {passed} lines are excited by u and were not tested" if passed else ""
         what = "No mains hum was found" if tested else "No line of the mains could be tested"
         sentence = f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note})."
-        picture = self._picture(kept[-1], 0, campaign, MAINS_HZ)
+        picture = self._picture(kept[-1], 0, MAINS_HZ)
         return found or [Finding(self.name, "ok", sentence, limit=FINDING.false_alarm, picture=picture)]
 
-    def _finding(self, campaign: Campaign, mains: float, hits: list[tuple[_Kept, _Line]]) -> Finding:
+    def _finding(self, mains: float, hits: list[tuple[_Kept, _Line]]) -> Finding:
         record, line = max(hits, key=lambda hit: hit[1].ratio)
-        name, unit = campaign.y_names[line.channel], campaign.y_unit
+        name, unit = self.campaign.y_names[line.channel], self.campaign.y_unit
         part = max(hit.rms / max(k.rms[hit.channel], 1e-300) for k, hit in hits)
         records = tuple(dict.fromkeys(k.record for k, _ in hits))
         at_Hz = [k * mains for k in sorted({round(hit.at_Hz / mains) for _, hit in hits})]
@@ -114,12 +113,12 @@ class Hum(Gate):
             "these lines out of the fit."
         )
         severity: Severity = "warning" if part > SETTINGS.large else "note"
-        picture = self._picture(record, line.channel, campaign, at_Hz)
+        picture = self._picture(record, line.channel, at_Hz)
         return Finding(self.name, severity, sentence, (name,), records, line.ratio, SETTINGS.least_ratio, picture)
 
-    def _picture(self, kept: _Kept, j: int, campaign: Campaign, at_Hz: Sequence[float]) -> Picture:
-        name = campaign.y_names[j]
-        label = f"amplitude density [{campaign.y_unit}/√Hz]"
+    def _picture(self, kept: _Kept, j: int, at_Hz: Sequence[float]) -> Picture:
+        name = self.campaign.y_names[j]
+        label = f"amplitude density [{self.campaign.y_unit}/√Hz]"
         series = Series(name, kept.f[1:], kept.asd[1:, j])
         limits = tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz)
         return over_frequency(f"Record {kept.record}, {name}", label, (series,), limits)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign, RecordHeader
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series
-from avis_ctrl.measurement.gates.h1 import H1, Spectra, h1, moving, segment_length, spectra
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
+from avis_ctrl.measurement.gates.h1 import H1, Samples, Spectra, h1
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,16 @@ SETTINGS = MissingSamplesSettings()
 
 @dataclass(frozen=True, eq=False)
 class _Kept:
+    """found : findings on rows that are repeated or missing; t, delay : as of `delays`, with its picture; stepped : the
+    delays with a step.
+    """
+
     header: RecordHeader
-    block: tuple[int, int, int] | None
+    found: list[Finding]
     t: np.ndarray
     delay: np.ndarray
+    picture: Picture
     stepped: list[np.ndarray]
-    clock: np.ndarray | None
 
 
 class MissingSamples(Gate):
@@ -68,7 +72,7 @@ class MissingSamples(Gate):
 
     name = "missing samples"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept:
+    def look(self, seen: Excerpt) -> _Kept:
         t, delay = delays(seen)
         stepped = [
             one
@@ -78,12 +82,18 @@ class MissingSamples(Gate):
             and not drifts(one, step[0])
             and explained(seen, t, *step) > SETTINGS.explains
         ]
-        block = repeated_block(seen.first.y, seen.header.period_samples)
-        return _Kept(seen.header, block, t, delay, stepped, _clock(seen))
+        picture = Picture(
+            f"Record {seen.header.name}: delay of y behind the response to u",
+            "time [s]",
+            "delay [samples]",
+            (Series("delay", t - seen.header.start_s, delay[0], "points"),),
+            (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)),
+        )
+        return _Kept(seen.header, list(self._rows(seen, picture)), t, delay, picture, stepped)
 
-    def conclude(self, kept: list[_Kept], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept]) -> list[Finding]:
         level = FINDING.false_alarm / max(1, sum(k.delay.size for k in kept))
-        found = [*self._overlaps(kept), *(f for k in kept for f in self._faults(k, level))]
+        found = [*self._overlaps(kept), *(f for k in kept for f in (*k.found, *self._steps(k, level)))]
         longest = max(kept, key=lambda k: len(k.t))
         comparable = [k for k in kept if len(k.t) > 3 and np.std(k.delay[0]) < SETTINGS.jump_samples]
         vague = sum(len(k.t) > 3 for k in kept) - len(comparable)
@@ -95,38 +105,41 @@ class MissingSamples(Gate):
             f"a moving commanded voltage{said})."
         )
         value, limit = scatter if comparable else None, SETTINGS.jump_samples
-        return found or [Finding(self.name, "ok", sentence, value=value, limit=limit, picture=_picture(longest))]
+        return found or [Finding(self.name, "ok", sentence, value=value, limit=limit, picture=longest.picture)]
 
-    def _faults(self, k: _Kept, level: float) -> Iterator[Finding]:
-        """Findings on one record."""
-        rate, name, picture = k.header.sample_rate_Hz, k.header.name, _picture(k)
-        if k.block:
-            at, back, n = k.block
+    def _rows(self, seen: Excerpt, picture: Picture) -> Iterator[Finding]:
+        """Findings on rows of one record that are repeated, or missing in u and y together."""
+        rate, name, clock = seen.header.sample_rate_Hz, seen.header.name, _clock(seen)
+        if block := repeated_block(seen.first.y, seen.header.period_samples):
+            at, back, n = block
             sentence = (
                 f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples before: a "
                 "buffer was written twice. Repeat the record."
             )
             yield Finding(self.name, "stop", sentence, (), (name,), n, SETTINGS.block_rows, picture)
-        if k.clock is not None and np.any(k.clock != 0):
-            p = int(np.flatnonzero(k.clock)[0])
+        if clock.any():
+            p = int(np.flatnonzero(clock)[0])
             # Within the period of the loss the correlation shows only part of the shift.
-            shift = float(k.clock[-1] or k.clock[p])
+            shift = float(clock[-1] or clock[p])
             sentence = (
                 f"The commanded voltage of record {name} is {abs(shift):g} samples off its period of "
-                f"{k.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or the stated period is "
-                "wrong. Check period_s, or repeat the record."
+                f"{seen.header.period_s:g} s from period {p + 1} on: rows are missing or doubled, or the stated period "
+                "is wrong. Check period_s, or repeat the record."
             )
             yield Finding(self.name, "stop", sentence, (), (name,), shift, 0.0, picture)
+
+    def _steps(self, k: _Kept, level: float) -> Iterator[Finding]:
+        """The largest significant step of the delay."""
         steps = [step for one in k.stepped if (step := delay_step(one, level)) is not None]
         at, size = max(steps, key=lambda step: abs(step[1]), default=(0, 0.0))
         if abs(size) > SETTINGS.jump_samples:
             change, what = ("shorter", "lost") if size < 0 else ("longer", "doubled")
             sentence = (
-                f"In record {name} the delay of the measured channels after the commanded voltage becomes "
+                f"In record {k.header.name} the delay of the measured channels after the commanded voltage becomes "
                 f"{abs(size):.1f} samples {change} at about {k.t[at] - k.header.start_s:.4g} s: about "
                 f"{max(1, round(abs(size)))} samples were {what}. Repeat the record, or use only the part before."
             )
-            yield Finding(self.name, "stop", sentence, (), (name,), size, SETTINGS.jump_samples, picture)
+            yield Finding(self.name, "stop", sentence, (), (k.header.name,), size, SETTINGS.jump_samples, k.picture)
 
     def _overlaps(self, kept: list[_Kept]) -> list[Finding]:
         if len({k.header.start_s for k in kept}) == 1:
@@ -140,7 +153,7 @@ class MissingSamples(Gate):
                     "s: the clocks or the sample rate are wrong. Check start_s and sample_rate_Hz."
                 )
                 records = a.header.name, b.header.name
-                found.append(Finding(self.name, "warning", sentence, (), records, start - end, 0.0, _picture(a)))
+                found.append(Finding(self.name, "warning", sentence, (), records, start - end, 0.0, a.picture))
         return found[:3]
 
 
@@ -153,21 +166,19 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
     rate = seen.header.sample_rate_Hz
-    u, y, length = _beginning(seen)
-    of = spectra(u, y, rate, length, wrap=False)
+    of = _beginning(seen).spectra()
     half = len(of.U) // 2
     parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
     estimates = [e for part in parts if (e := h1([part])) is not None]
     if not estimates:
         return np.zeros(0), np.zeros((1, 0))
-    t = seen.first.header.start_s + (np.arange(len(of.U)) * (length // 2) + length / 2) / rate
+    # A segment lasts 1 / of.f[1] seconds; the next one starts after half of it.
+    t = seen.first.header.start_s + (np.arange(len(of.U)) + 1) / (2 * of.f[1])
     return t, np.array([_delay(of, estimate, rate) for estimate in estimates])
 
 
-def _beginning(seen: Excerpt) -> tuple[np.ndarray, np.ndarray, int]:
-    """u and y of the beginning of the record, and the length of its segments."""
-    u, y = seen.first.u[: 1 << 17], seen.first.y[: 1 << 17]
-    return u, y, segment_length(len(u), moving(seen.first.u))
+def _beginning(seen: Excerpt) -> Samples:
+    return Samples(seen.first.u[: 1 << 17], seen.first.y[: 1 << 17], seen.header.sample_rate_Hz)
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
@@ -196,8 +207,8 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     result is -inf.
     """
     rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
-    u, y, length = _beginning(seen)
-    of = spectra(u, y, rate, length, wrap=False)
+    samples = _beginning(seen)
+    y, of = samples.y, samples.spectra()
     before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
     first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
     showing = of.f[np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second)]
@@ -208,7 +219,7 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
             whole = np.concatenate([y[:at], np.repeat(y[at : at + 1], count, axis=0), y[at:]])[: len(y)]
         else:
             whole = np.concatenate([y[:at], y[at + count :], np.repeat(y[-1:], count, axis=0)])
-        after = h1([spectra(u, whole, rate, length, wrap=False)])
+        after = h1([replace(samples, y=whole).spectra()])
         if before is not None and after is not None:
             f = np.intersect1d(showing, np.intersect1d(before.f, after.f))
             if f.size > SETTINGS.showing * before.f.size:
@@ -271,10 +282,10 @@ def repeated_block(y: np.ndarray, period: int | None) -> tuple[int, int, int] | 
     return int(where[0]), lag, int(len(where) + rows - 1)
 
 
-def _clock(seen: Excerpt) -> np.ndarray | None:
-    """(periods,) shift in samples of each period of u against the first; None if u is not periodic."""
+def _clock(seen: Excerpt) -> np.ndarray:
+    """(periods,) shift in samples of each period of u against the first; empty if u is not periodic."""
     if not seen.periodic or not seen.driven:
-        return None
+        return np.zeros(0)
     u = seen.periods("u")
     if np.allclose(u, u[:1], rtol=0, atol=1e-6 * np.max(np.abs(u))):
         return np.zeros(len(u))
@@ -282,14 +293,3 @@ def _clock(seen: Excerpt) -> np.ndarray | None:
     c = np.fft.irfft(np.sum(U * U[:1].conj(), axis=2), u.shape[1], axis=1)
     shift = np.argmax(c, axis=1)
     return np.where(shift > u.shape[1] // 2, shift - u.shape[1], shift).astype(float)
-
-
-def _picture(kept: _Kept) -> Picture:
-    t = kept.t - kept.header.start_s
-    return Picture(
-        f"Record {kept.header.name}: delay of y behind the response to u",
-        "time [s]",
-        "delay [samples]",
-        (Series("delay", t, kept.delay[0], "points"),),
-        (Limit("half a sample", SETTINGS.jump_samples), Limit("half a sample", -SETTINGS.jump_samples)),
-    )

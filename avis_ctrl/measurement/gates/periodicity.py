@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, curves, percent, quoted, times
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, curves, percent, quoted, those, times
 
 
 @dataclass(frozen=True)
@@ -52,19 +51,18 @@ class Periodicity(Gate):
 
     name = "periodicity"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+    def look(self, seen: Excerpt) -> _Kept | None:
         if not seen.periodic or not seen.driven or len(y := seen.periods("y")) < 4:
             return None
         T, relative, lines, R = compared(y)
         drift = trend(y[len(y) - R :]) if R > 2 else None
         return _Kept(seen.header.name, seen.header.period_s or 0.0, T, relative, lines, R - 1, drift)
 
-    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[_Kept | None]) -> list[Finding]:
         judged = [k for k in kept if k is not None]
         if not judged:
             sentence = "Periodicity was not tested: no record is periodic with four periods or more."
-            picture = Picture("Periods against the last ones", "period", "ratio to noise [-]", ())
-            return [Finding(self.name, "ok", sentence, picture=picture)]
+            return [Finding(self.name, "ok", sentence)]
         level = FINDING.false_alarm / sum(k.T.size for k in judged)
         found: list[Finding] = []
         drops: list[tuple[int, _Kept, float, Picture]] = []
@@ -74,14 +72,13 @@ class Periodicity(Gate):
                 f"Record {k.record}: periods against the last {len(k.T) // 2}",
                 "period",
                 "difference by noise, power [-]",
-                curves(campaign.y_names, np.arange(1, len(k.T) + 1), k.T, "points"),
+                curves(self.campaign.y_names, np.arange(1, len(k.T) + 1), k.T, "points"),
                 (Limit("1 % limit for noise", limit),),
                 y_scale="log",
             )
             failed = np.flatnonzero((limit < k.T).any(axis=1))
             drop = int(failed[-1]) + 1 if len(failed) else 0
-            drifting = self._drifting(k, level, campaign, picture)
-            if warned := drifting or self._unsettled(k, drop, limit, campaign, picture):
+            if warned := self._unsteady(k, drop, limit, level, picture):
                 found.append(warned)
             else:
                 drops.append((drop, k, limit, picture))
@@ -104,38 +101,37 @@ class Periodicity(Gate):
         )
         return found or [Finding(self.name, "ok", sentence, value=largest, limit=limit, picture=picture)]
 
-    def _unsettled(self, k: _Kept, drop: int, limit: float, campaign: Campaign, picture: Picture) -> Finding | None:
-        """Finding if periods of the reference itself differ."""
+    def _unsteady(self, k: _Kept, drop: int, limit: float, level: float, picture: Picture) -> Finding | None:
+        """Finding if the periods of the reference change steadily, or differ."""
         P = len(k.T)
-        reference = P - P // 2
-        if drop <= reference:
+        bad: np.ndarray = np.zeros(len(self.campaign.y_names), bool)
+        if k.drift is not None:
+            T, drift = k.drift
+            of_drift = float(stats.f.isf(level, k.lines, k.lines * (k.dof - 1)))
+            bad = (of_drift < T) & (drift > SETTINGS.drift)
+        if bad.any():
+            names, largest, limit = those(self.campaign.y_names, bad), T[bad].max(), of_drift
+            said = (
+                f"drifts: over its last {P // 2} periods of {k.period_s:g} s {quoted(names)} change steadily by "
+                f"{percent(drift[bad].max())} of the signal ({times(float(largest))} the noise power; limit for noise "
+                f"alone {limit:.2f})"
+            )
+        elif drop > P - P // 2:
+            names, largest = (
+                those(self.campaign.y_names, np.any(k.T[P - P // 2 :] > limit, axis=0)),
+                k.T[drop - 1].max(),
+            )
+            said = (
+                f"has not settled after {drop} of {P} periods of {k.period_s:g} s: {quoted(names)} still differ by "
+                f"{times(float(np.sqrt(largest)))} the noise, {percent(k.relative[drop - 1].max())} of the signal"
+            )
+        else:
             return None
-        bad = tuple(n for j, n in enumerate(campaign.y_names) if (k.T[reference:, j] > limit).any())
-        largest = k.T[drop - 1].max()
         sentence = (
-            f"Record {k.record} has not settled after {drop} of {P} periods of {k.period_s:g} s: {quoted(bad)} still "
-            f"differ by {times(float(np.sqrt(largest)))} the noise, {percent(k.relative[drop - 1].max())} of the "
-            "signal. The rig drifts, or the transient is longer than the record. Wait longer before recording, or look "
-            "for drift."
+            f"Record {k.record} {said}. The rig drifts, or the transient is longer than the record. Wait longer before "
+            "recording, or find the cause of the drift."
         )
-        return Finding(self.name, "warning", sentence, bad, (k.record,), largest, limit, picture)
-
-    def _drifting(self, k: _Kept, level: float, campaign: Campaign, picture: Picture) -> Finding | None:
-        if k.drift is None:
-            return None
-        T, drift = k.drift
-        limit = float(stats.f.isf(level, k.lines, k.lines * (k.dof - 1)))
-        bad = (limit < T) & (drift > SETTINGS.drift)
-        if not bad.any():
-            return None
-        names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
-        sentence = (
-            f"Record {k.record} drifts: over its last {len(k.T) // 2} periods of {k.period_s:g} s {quoted(names)} "
-            f"change steadily by {percent(drift[bad].max())} of the signal ({times(float(T[bad].max()))} the noise "
-            f"power; limit for noise alone {limit:.2f}). The rig drifts, or the transient is longer than the record. "
-            "Wait longer before recording, or find the cause of the drift."
-        )
-        return Finding(self.name, "warning", sentence, names, (k.record,), T[bad].max(), limit, picture)
+        return Finding(self.name, "warning", sentence, names, (k.record,), largest, limit, picture)
 
 
 def windowed(difference: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import (
-    Expectation,
     Finding,
     Limit,
     Picture,
@@ -22,8 +21,9 @@ from avis_ctrl.measurement.gates.finding import (
     over_frequency,
     percent,
     quoted,
+    those,
 )
-from avis_ctrl.measurement.gates.h1 import Spectra, driven_lines, h1, octaves, record_spectra, usable
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, driven_lines, h1, octaves, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -55,25 +55,18 @@ LEVEL_DEPENDENCE = "level dependence"  # gate name of the findings on different 
 
 
 @dataclass(frozen=True, eq=False)
-class _Mean:
-    """Mean of the periods after the first, u and y (samples, channels), with the variance of its windowed lines."""
-
-    u: np.ndarray
-    y: np.ndarray
-    variance: np.ndarray
-    dof: int
-
-
-@dataclass(frozen=True, eq=False)
 class _Kept:
-    """Data of one record; mean : for periodic records only."""
+    """Data of one record; of periodic records also the mean period, with the variance (lines, n_y) of its windowed
+    lines and the degrees of freedom of this variance.
+    """
 
     record: str
     kind: str
     level: float
-    rate: float
     of: Spectra
-    mean: _Mean | None = None
+    mean: Samples | None = None
+    variance: np.ndarray | None = None
+    dof: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,36 +102,35 @@ class Comparison(Gate):
 
     name = "repeatability"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Kept | None:
+    def look(self, seen: Excerpt) -> _Kept | None:
         h = seen.header
         if not seen.driven or h.excitation == "sine":
             return None
-        u, y, wrap = usable(seen)
-        of = record_spectra(u, y, wrap, h.sample_rate_Hz)
-        kept = _Kept(h.name, h.excitation, h.level_V, h.sample_rate_Hz, of)
-        if not wrap or (periods := seen.periods("y")[1:]).shape[0] < 3:
+        mean = usable(seen)
+        kept = _Kept(h.name, h.excitation, h.level_V, mean.spectra())
+        if not mean.wrap or (P := len(periods := seen.periods("y")[1:])) < 3:
             return kept
-        P = len(periods)
-        variance = smoothed(np.sum(np.abs(windowed(periods - y)) ** 2, axis=0) / (P - 1)) / P
-        return replace(kept, mean=_Mean(u, y, variance, P - 1))
+        variance = smoothed(np.sum(np.abs(windowed(periods - mean.y)) ** 2, axis=0) / (P - 1)) / P
+        return replace(kept, mean=mean, variance=variance, dof=P - 1)
 
-    def conclude(self, kept: list[_Kept | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        groups, n_y = _by_kind_and_level(kept), len(campaign.y_names)
-        pairs = [(group[0], other) for group in groups.values() for other in group[1:]]
+    def conclude(self, kept: list[_Kept | None]) -> list[Finding]:
+        groups, n_y = _by_kind_and_level(kept), len(self.campaign.y_names)
+        pairs = [(first, b) for first, *others in groups.values() for b in others if len(b.of.f) == len(first.of.f)]
         level = FINDING.false_alarm / max(1, len(pairs) * n_y)
-        repeats = [d for a, b in pairs if (d := difference(a, b, level)) is not None]
+        compared = [difference([a], [b], level, (f"record {a.record}", f"record {b.record}")) for a, b in pairs]
+        repeats = [*filter(None, compared)]
         apart = [(a, b) for a, b in combinations(sorted(groups), 2) if a[0] == b[0] and b[1] >= SETTINGS.apart * a[1]]
         level = FINDING.false_alarm / max(1, len(apart) * n_y)
-        levels = [d for a, b in apart if (d := _of_levels(groups[a], groups[b], level)) is not None]
+        compared = [difference(groups[a], groups[b], level, (f"{a[1]:g} V", f"{b[1]:g} V")) for a, b in apart]
         agreed = "One pair of records agrees" if len(repeats) == 1 else f"{len(repeats)} pairs of records agree"
         untested = "Repeatability was not tested: no two driven records of one level and enough length."
-        found = _judged(self.name, repeats, campaign, _drifted, agreed, untested)
+        found = _judged(self.name, repeats, self.campaign, _drifted, agreed, untested)
         untested = (
             "Dependence on the level was not tested: no driven records of one kind and enough length at two levels, at "
             f"least a factor {SETTINGS.apart:g} apart."
         )
         agreed = "The responses at all levels agree"
-        return found + _judged(LEVEL_DEPENDENCE, levels, campaign, _nonlinear, agreed, untested)
+        return found + _judged(LEVEL_DEPENDENCE, [*filter(None, compared)], self.campaign, _nonlinear, agreed, untested)
 
 
 def _drifted(d: Difference, bad: np.ndarray, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
@@ -170,13 +162,12 @@ def _judged(
 ) -> list[Finding]:
     """Findings on significant differences, or that there are none; then a note if the comparison is not sensitive."""
     if not differences:
-        picture = Picture(gate.capitalize(), "frequency [Hz]", "relative difference [-]", ())
-        return [Finding(gate, "ok", untested, picture=picture)]
+        return [Finding(gate, "ok", untested)]
     found = []
     for d in differences:
         bad = (d.T > 1) & (d.relative > SETTINGS.notable)
         if bad.any():
-            names = tuple(n for j, n in enumerate(campaign.y_names) if bad[j])
+            names = those(campaign.y_names, bad)
             severity: Severity = "warning" if d.relative[bad].max() > SETTINGS.large else "note"
             sentence, records = described(d, bad, names)
             picture = _picture(d, campaign.y_names)
@@ -218,21 +209,12 @@ def _rounded(level: float) -> float:
     return float(f"{level:.2g}")
 
 
-def difference(a: _Kept, b: _Kept, level: float) -> Difference | None:
-    """Difference of two records; None if they cannot be compared."""
-    names = f"record {a.record}", f"record {b.record}"
-    if (found := _same_input(a, b, level, names)) is not None or len(a.of.f) != len(b.of.f):
-        return found
-    return _compared([a.of], [b.of], level, names)
-
-
-def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | None:
-    names = f"{_rounded(a[0].level):g} V", f"{_rounded(b[0].level):g} V"
+def difference(a: list[_Kept], b: list[_Kept], level: float, names: tuple[str, str]) -> Difference | None:
+    """Difference of two groups of records; None if they cannot be compared."""
     for one in a:
         for other in b:
             if (d := _same_input(one, other, level, names)) is not None:
                 return d
-
     first, second = ([k.of for k in group if len(k.of.f) == len(group[0].of.f)] for group in (a, b))
     return _compared(first, second, level, names)
 
@@ -240,21 +222,21 @@ def _of_levels(a: list[_Kept], b: list[_Kept], level: float) -> Difference | Non
 def _same_input(a: _Kept, b: _Kept, level: float, names: tuple[str, str]) -> Difference | None:
     """If u of b is a multiple of u of a: y of b compared with the same multiple of y of a; otherwise None."""
     first, second = a.mean, b.mean
-    if first is None or second is None or first.u.shape != second.u.shape:
+    if first is None or second is None or a.variance is None or b.variance is None or first.u.shape != second.u.shape:
         return None
     power = float(np.sum(first.u * first.u))
     scale = float(np.sum(first.u * second.u)) / power if power else 0.0
     if scale <= 0 or np.max(np.abs(second.u - scale * first.u)) > 1e-3 * np.max(np.abs(second.u)):
         return None
     D = windowed(second.y - scale * first.y)
-    variance = np.maximum(second.variance + scale**2 * first.variance, 1e-300)
+    variance = np.maximum(b.variance + scale**2 * a.variance, 1e-300)
     size = np.abs(windowed(second.y - second.y.mean(axis=0))) ** 2
-    f = np.fft.rfftfreq(len(first.y), 1 / a.rate)[2:-1:2]
+    f = np.fft.rfftfreq(len(first.y), 1 / first.rate_Hz)[2:-1:2]
     driven = np.sum(np.abs(windowed(second.u)) ** 2, axis=1)
     keep = driven_lines(driven)
     keep &= driven > SETTINGS.excited * np.median(driven[keep])
     f, power, variance, size = f[keep], np.abs(D[keep]) ** 2, variance[keep], size[keep]
-    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(first.dof, second.dof), level)
+    return _in_octaves(names, f, power / variance, power, variance, size, 1, min(a.dof, b.dof), level)
 
 
 def _in_octaves(

@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    Severity,
-    curves,
-    over_frequency,
-)
-from avis_ctrl.measurement.gates.h1 import (
-    H1,
-    centres,
-    driven_lines,
-    h1,
-    octaves,
-    record_spectra,
-    spectra,
-    thirds,
-    usable,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Severity, bars, curves, over_frequency
+from avis_ctrl.measurement.gates.h1 import H1, Samples, centres, driven_lines, h1, octaves, thirds, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
 
@@ -77,28 +57,27 @@ class SignalToNoise(Gate):
 
     name = "signal to noise"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Noise:
-        noise = _high_noise(seen) if expectation.sensor_noise_rms_V else None
+    def look(self, seen: Excerpt) -> _Noise:
+        noise = _high_noise(seen) if self.expectation.sensor_noise_rms_V else None
         return _Noise(*_snr(seen), noise)
 
-    def conclude(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> list[Finding]:
-        noisy = list(self._noisy(kept, campaign, expectation))
+    def conclude(self, kept: list[_Noise]) -> list[Finding]:
+        noisy = list(self._noisy(kept))
         measured = [k for k in kept if k.snr is not None and len(k.f)]
         if not measured:
             sentence = "No driven record is long enough to separate signal and noise."
-            picture = Picture("Signal to noise", "frequency [Hz]", "ratio [dB]", ())
-            return noisy or [Finding(self.name, "ok", sentence, picture=picture)]
+            return noisy or [Finding(self.name, "ok", sentence)]
         best = max(measured, key=lambda k: float(np.median(np.asarray(k.snr))))
         f, snr = best.f, np.asarray(best.snr)
         bands = octaves(f)
         dB = np.array([10 * np.log10(np.maximum(snr[band].mean(axis=0), 1e-6)) for band in bands])
         middle = centres(f, bands)
-        series, low = curves(campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
+        series, low = curves(self.campaign.y_names, middle, dB, "points"), Limit("low", SETTINGS.low_dB)
         picture = over_frequency("Signal to noise of the best record", "ratio [dB]", series, (low,), "linear")
-        found = noisy + list(self._weak(campaign.y_names, middle, dB, best.segment_s, picture))
+        found = noisy + list(self._weak(self.campaign.y_names, middle, dB, best.segment_s, picture))
         b, j = divmod(int(np.argmin(dB)), dB.shape[1])
         sentence = (
-            f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {campaign.y_names[j]!r} around "
+            f"Signal to noise is at least {dB[b, j]:.0f} dB in every band (lowest {self.campaign.y_names[j]!r} around "
             f"{middle[b]:.3g} Hz)."
         )
         return found or [Finding(self.name, "ok", sentence, value=dB[b, j], limit=SETTINGS.low_dB, picture=picture)]
@@ -125,39 +104,22 @@ class SignalToNoise(Gate):
                 sentence = f"Channel {name!r} has little signal: {low}{advice}"
                 yield Finding(self.name, "note", sentence, (name,), (), levels.min(), SETTINGS.low_dB, picture)
 
-    def _noisy(self, kept: list[_Noise], campaign: Campaign, expectation: Expectation) -> Iterator[Finding]:
-        stated = expectation.sensor_noise_rms_V
+    def _noisy(self, kept: list[_Noise]) -> Iterator[Finding]:
+        stated = self.expectation.sensor_noise_rms_V
         levels = [k.noise_rms for k in kept if k.noise_rms is not None]
         if stated is None or not levels:
             return
         rms = np.median(levels, axis=0)
-        picture = Picture(
-            "Noise of each channel, from above half the Nyquist frequency",
-            "channel",
-            f"r.m.s. [{campaign.y_unit}]",
-            (Series("measured", np.arange(len(rms)), rms, "bars"),),
-            (Limit("stated", stated),),
-            y_scale="log",
-            x_names=campaign.y_names,
-        )
-        for name, one in zip(campaign.y_names, rms, strict=True):
+        heights, label = dict(zip(self.campaign.y_names, rms, strict=True)), f"r.m.s. [{self.campaign.y_unit}]"
+        title = "Noise of each channel, from above half the Nyquist frequency"
+        picture = bars(title, "channel", label, heights, (Limit("stated", stated),), "log")
+        for name, one in heights.items():
             if one > (limit := SETTINGS.noise_factor * stated):
                 sentence = (
-                    f"Channel {name!r} has sensor noise of {one:.3g} {campaign.y_unit} r.m.s., {one / stated:.1f} "
+                    f"Channel {name!r} has sensor noise of {one:.3g} {self.campaign.y_unit} r.m.s., {one / stated:.1f} "
                     "times what the rig file states. Check its preamplifier and cable, or correct the rig file."
                 )
                 yield Finding(self.name, "warning", sentence, (name,), (), one, limit, picture)
-
-
-@dataclass(frozen=True, eq=False)
-class _Coherence:
-    """u (samples, n_u), y (samples, n_y) of a driven record; wrap: they are one period."""
-
-    level: float
-    rate: float
-    u: np.ndarray
-    y: np.ndarray
-    wrap: bool
 
 
 class Coherence(Gate):
@@ -173,20 +135,20 @@ class Coherence(Gate):
 
     name = "coherence"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> _Coherence | None:
+    def look(self, seen: Excerpt) -> tuple[float, Samples] | None:
+        """Level and samples of a driven record."""
         if not seen.driven or seen.header.excitation == "sine":
             return None
-        return _Coherence(seen.header.level_V, seen.header.sample_rate_Hz, *usable(seen))
+        return seen.header.level_V, usable(seen)
 
-    def conclude(self, kept: list[_Coherence | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[tuple[float, Samples] | None]) -> list[Finding]:
         driven = [k for k in kept if k is not None]
-        top = max((k.level for k in driven), default=0.0)
-        chosen = [k for k in driven if k.level * SETTINGS.same_level >= top]
+        top = max((level for level, _ in driven), default=0.0)
+        chosen = [samples for level, samples in driven if level * SETTINGS.same_level >= top]
         best, seconds = _pooled(chosen)
         if best is None:
             sentence = "No driven record is long enough for a coherence of all inputs together."
-            picture = Picture("Multiple coherence", "frequency [Hz]", "coherence [-]", ())
-            return [Finding(self.name, "ok", sentence, picture=picture)]
+            return [Finding(self.name, "ok", sentence)]
         free = best.unbiased_coherence()
         bands = thirds(best.f)
         middle = centres(best.f, bands)
@@ -194,8 +156,8 @@ class Coherence(Gate):
         # Standard deviation of an estimate of 0.5: (1 - g) sqrt(2 g / K), Bendat and Piersol table 9.6.
         z = stats.norm.isf(FINDING.false_alarm / mean.size)
         margin = np.array([z * 0.5 / np.sqrt(best.dof * max(1, int(b.sum()))) for b in bands])
-        surely = np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)
-        series, limit = curves(campaign.y_names, middle, mean), SETTINGS.low_coherence
+        surely = np.flatnonzero(np.all(mean < SETTINGS.low_coherence - margin[:, None], axis=0)).tolist()
+        series, limit = curves(self.campaign.y_names, middle, mean), SETTINGS.low_coherence
         title = f"Multiple coherence at {top:.3g} V, third octaves"
         picture = over_frequency(title, "coherence [-]", series, (Limit("low", limit),), "linear")
         below, excited = "", _lowest_driven(chosen)
@@ -204,33 +166,34 @@ class Coherence(Gate):
                 f" Below {best.f[0]:.3g} Hz, down to {excited:.3g} Hz where the voltage begins, the records are "
                 "too short for a coherence of all inputs."
             )
-        low = np.any(mean < SETTINGS.low_coherence, axis=0)
-        groups = [[int(j)] for j in np.flatnonzero(surely)] + [[int(j) for j in np.flatnonzero(low & ~surely)]]
-        found = [
-            self._low(campaign.y_names, group, middle, mean, bool(surely[group[0]]), seconds, below, picture)
-            for group in groups
-            if group
-        ]
+        low = np.flatnonzero(np.any(mean < SETTINGS.low_coherence, axis=0)).tolist()
+        causes = (
+            "Causes are noise, an input that is not recorded, nonlinearity, or, if the signal to noise is high, "
+            f"leakage of a mode that decays more slowly than the segments of {seconds:.3g} s. Longer records "
+            f"distinguish leakage from the other causes; a higher level reduces the influence of noise.{below}"
+        )
+        found = [self._low(self.campaign.y_names, [j], middle, mean, causes, picture) for j in surely]
+        if some := [j for j in low if j not in surely]:
+            found.append(self._low(self.campaign.y_names, some, middle, mean, causes, picture, "note"))
         b, j = divmod(int(np.argmin(mean)), mean.shape[1])
         lowest = mean[b, j]
         sentence = (
             f"Multiple coherence is at least {lowest:.2f} in every third-octave band from {best.f[0]:.3g} to "
-            f"{best.f[-1]:.3g} Hz (lowest {campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"
+            f"{best.f[-1]:.3g} Hz (lowest {self.campaign.y_names[j]!r} around {middle[b]:.3g} Hz).{below}"
         )
         return found or [Finding(self.name, "ok", sentence, value=lowest, limit=limit, picture=picture)]
 
     def _low(
         self,
         names: tuple[str, ...],
-        group: list[int],
+        group: Sequence[int],
         middle: np.ndarray,
         mean: np.ndarray,
-        surely: bool,
-        seconds: float,
-        below: str,
+        causes: str,
         picture: Picture,
+        severity: Severity = "warning",
     ) -> Finding:
-        """Finding on one channel that is low everywhere, or on all channels that are low somewhere."""
+        """Finding on one channel that is low everywhere (a warning), or on all that are low somewhere (a note)."""
         ordered = sorted(group, key=lambda j: float(mean[:, j].min()))
         said = []
         for j in ordered[:4]:
@@ -241,20 +204,16 @@ class Coherence(Gate):
                 f"{count} band{'s' * (count > 1)})"
             )
         more = f" and {len(group) - 4} more channel{'s' * (len(group) > 5)}" if len(group) > 4 else ""
-        severity: Severity = "warning" if surely else "note"
-        part = "all" if surely else "some"
+        part = "all" if severity == "warning" else "some"
         sentence = (
             f"Multiple coherence is below {SETTINGS.low_coherence:g} in {part} of the {len(middle)} third-octave "
-            f"bands: {'; '.join(said)}{more}. Causes are noise, an input that is not recorded, nonlinearity, or, if "
-            "the signal to noise is high, leakage of a mode that decays more slowly than the segments of "
-            f"{seconds:.3g} s. Longer records distinguish leakage from the other causes; a higher level reduces the "
-            f"influence of noise.{below}"
+            f"bands: {'; '.join(said)}{more}. {causes}"
         )
         channels, lowest = tuple(names[j] for j in ordered), mean[:, group].min()
         return Finding(self.name, severity, sentence, channels, (), lowest, SETTINGS.low_coherence, picture)
 
 
-def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
+def _pooled(chosen: list[Samples]) -> tuple[H1 | None, float]:
     """H1 over records, with the longest segments that are numerous enough, and their length in s."""
     if not chosen:
         return None, 0.0
@@ -262,21 +221,20 @@ def _pooled(chosen: list[_Coherence]) -> tuple[H1 | None, float]:
     shortest, samples = min(len(k.u) for k in chosen), sum(len(k.u) for k in chosen)
     length = 1 << int(np.log2(max(16, shortest)))
     # The longest segments that are numerous enough: twice the number of inputs plus 8.
-    rate = chosen[0].rate
     while length >= 16:
         enough = 2 * samples / length >= 2 * n_u + 8
-        if enough and (made := h1([spectra(k.u, k.y, rate, length, k.wrap) for k in chosen])) is not None:
-            return made, length / rate
+        if enough and (made := h1([k.spectra(length) for k in chosen])) is not None:
+            return made, length / chosen[0].rate_Hz
         length //= 2
     return None, 0.0
 
 
-def _lowest_driven(chosen: list[_Coherence]) -> float:
+def _lowest_driven(chosen: list[Samples]) -> float:
     """Lowest frequency [Hz] of the whole records at which the voltages have a thousandth of their largest power."""
     lowest = []
     for k in chosen:
         power = np.sum(np.abs(np.fft.rfft(k.u - k.u.mean(axis=0), axis=0)) ** 2, axis=1)
-        lowest.append(float(np.flatnonzero(driven_lines(power))[0]) * k.rate / len(k.u))
+        lowest.append(float(np.flatnonzero(driven_lines(power))[0]) * k.rate_Hz / len(k.u))
     return min(lowest)
 
 
@@ -298,7 +256,7 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
-    of = record_spectra(*usable(seen), rate)
+    of = usable(seen).spectra()
     if (estimate := h1([of])) is None:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.unbiased_coherence(), 0.0)

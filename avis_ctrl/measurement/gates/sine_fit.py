@@ -68,26 +68,19 @@ def second_order(f: np.ndarray, H: np.ndarray) -> SecondOrder:
     """The best of low-pass, band-pass and high-pass, by robust least squares of relative errors from several
     corners."""
     s = 2j * np.pi * f
-    best: SecondOrder | None = None
+    found = []
     for k in KINDS:
 
-        def shape(q: np.ndarray, k: int = k) -> np.ndarray:
+        def errors(q: np.ndarray, k: int = k) -> np.ndarray:
             w0, damping = np.exp(q[0]), np.exp(q[1])
             G = s**k * w0 ** (2 - k) / (s * s + 2 * damping * w0 * s + w0 * w0)
             ratio = G / H
             # With the best-fitting gain (real, of either sign).
-            return ratio * (np.sum(ratio.real) / np.sum(np.abs(ratio) ** 2)) - 1
-
-        def errors(q: np.ndarray) -> np.ndarray:
-            e = shape(q)
+            e = ratio * (np.sum(ratio.real) / np.sum(np.abs(ratio) ** 2)) - 1
             return np.concatenate([e.real, e.imag])
 
         for corner in np.geomspace(f[0], f[-1], 5):
             q = least_squares(errors, [np.log(2 * np.pi * corner), np.log(0.5)], loss="soft_l1", f_scale=0.05).x
-            made = SecondOrder(
-                k, float(np.exp(q[0]) / (2 * np.pi)), float(np.exp(q[1])), float(np.median(np.abs(shape(q))))
-            )
-            if best is None or made.misfit < best.misfit:
-                best = made
-    assert best is not None
-    return best
+            misfit = float(np.median(np.hypot(*np.split(errors(q), 2))))
+            found.append(SecondOrder(k, float(np.exp(q[0]) / (2 * np.pi)), float(np.exp(q[1])), misfit))
+    return min(found, key=lambda one: one.misfit)

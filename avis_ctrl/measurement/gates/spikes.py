@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.measurement.campaign import Campaign
+from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import Expectation, Finding, Limit, Picture, Series, samples_over_time, times
+from avis_ctrl.measurement.gates.finding import Finding, Limit, bars, samples_over_time, times
 
 # Departure from the cubic through the two neighbours on either side: x0 - (4 (x-1 + x1) - (x-2 + x2)) / 6. These are
 # also the five departures around a spike of height 1.
@@ -35,22 +35,6 @@ class SpikeSettings:
 SETTINGS = SpikeSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class _Kept:
-    """Spikes in one channel of a record: number; sample, time [s], value and interpolated value of the largest."""
-
-    record: str
-    channel: str
-    count: int
-    sample: int
-    at_s: float
-    value: float
-    expected: float
-    ratio: float
-    t: np.ndarray
-    x: np.ndarray
-
-
 class Spikes(Gate):
     """Single samples away from the cubic through their four neighbours.
 
@@ -63,53 +47,47 @@ class Spikes(Gate):
 
     name = "spikes"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> tuple[list[_Kept], float]:
+    def look(self, seen: Excerpt) -> tuple[list[Finding], float]:
+        """Findings on the record, and the largest median departure."""
         found, least = [], 0.0
         for piece in seen.pieces:
             t = piece.time - seen.header.start_s
             for name, x in zip(seen.header.y_names, piece.y.T, strict=True):
-                where, ratio, spread = spikes(x, expectation.y_lsb_V)
+                where, ratio, spread = spikes(x, self.expectation.y_lsb_V)
                 least = max(least, float(np.max(spread, initial=0.0)))
                 if len(where):
-                    k = int(where[np.argmax(ratio)])
-                    part = slice(max(0, k - 100), k + 100)
-                    expected = float(x[k] - departure(x[k - 2 : k + 3])[0])
-                    sample = k + round(float(t[0]) * seen.header.sample_rate_Hz)
-                    spike = sample, float(t[k]), float(x[k]), expected, float(ratio.max())
-                    found.append(_Kept(seen.header.name, name, len(where), *spike, t[part], x[part]))
+                    found.append(self._finding(seen.header, name, t, x, where, ratio))
         return found, least
 
-    def conclude(
-        self, kept: list[tuple[list[_Kept], float]], campaign: Campaign, expectation: Expectation
-    ) -> list[Finding]:
-        found = [self._finding(k, campaign.y_unit) for of, _ in kept for k in of]
-        if found:
+    def conclude(self, kept: list[tuple[list[Finding], float]]) -> list[Finding]:
+        if found := [finding for of, _ in kept for finding in of]:
             return found
         least = np.array([SETTINGS.factor * one for _, one in kept])
         sentence = (
-            f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} {campaign.y_unit} "
-            "would be found in every record."
+            f"No single sample differs from its neighbours; a spike of more than {least.max():.2g} "
+            f"{self.campaign.y_unit} would be found in every record."
         )
-        picture = Picture(
-            "Smallest spike that would be found",
-            "record",
-            f"spike [{campaign.y_unit}]",
-            (Series("least spike", np.arange(len(least)), least, "bars"),),
-            x_names=tuple(r.header.name for r in campaign.records),
-        )
+        heights = dict(zip((r.header.name for r in self.campaign.records), least, strict=True))
+        picture = bars("Smallest spike that would be found", "record", f"spike [{self.campaign.y_unit}]", heights)
         return [Finding(self.name, "ok", sentence, value=least.max(), picture=picture)]
 
-    def _finding(self, k: _Kept, unit: str) -> Finding:
-        many = f"{k.count} single samples, the worst" if k.count > 1 else "a single sample"
+    def _finding(
+        self, header: RecordHeader, channel: str, t: np.ndarray, x: np.ndarray, where: np.ndarray, ratio: np.ndarray
+    ) -> Finding:
+        """Finding on the spikes x[where] of a channel, with their ratios to the usual departure."""
+        k, largest = int(where[np.argmax(ratio)]), float(ratio.max())
+        many = f"{len(where)} single samples, the worst" if len(where) > 1 else "a single sample"
         sentence = (
-            f"Channel {k.channel!r} of record {k.record} has {many} far from the neighbours, at {k.at_s:.6g} s (sample "
-            f"{k.sample}): {k.value:.4g} {unit}, while interpolation gives {k.expected:.4g}. The deviation is "
-            f"{times(k.ratio)} the usual one (limit {SETTINGS.factor:g}): an electrical disturbance or a faulty "
-            "conversion. Check cables and grounding; repeat the record, or replace the sample by the interpolated "
-            "value."
+            f"Channel {channel!r} of record {header.name} has {many} far from the neighbours, at {t[k]:.6g} s (sample "
+            f"{k + round(float(t[0]) * header.sample_rate_Hz)}): {x[k]:.4g} {header.y_unit}, while interpolation gives "
+            f"{x[k] - departure(x[k - 2 : k + 3])[0]:.4g}. The deviation is {times(largest)} the usual one (limit "
+            f"{SETTINGS.factor:g}): an electrical disturbance or a faulty conversion. Check cables and grounding; "
+            "repeat the record, or replace the sample by the interpolated value."
         )
-        picture = samples_over_time(k.record, k.channel, k.t, k.x, unit, (Limit("spike", k.at_s, "x"),))
-        return Finding(self.name, "warning", sentence, (k.channel,), (k.record,), k.ratio, SETTINGS.factor, picture)
+        part = slice(max(0, k - 100), k + 100)
+        limits = (Limit("spike", float(t[k]), "x"),)
+        picture = samples_over_time(header.name, channel, t[part], x[part], header.y_unit, limits)
+        return Finding(self.name, "warning", sentence, (channel,), (header.name,), largest, SETTINGS.factor, picture)
 
 
 def spikes(x: np.ndarray, lsb: float | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

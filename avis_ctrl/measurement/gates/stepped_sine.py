@@ -13,17 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
-from avis_ctrl.measurement.gates.finding import (
-    Expectation,
-    Finding,
-    Limit,
-    Picture,
-    Series,
-    over_frequency,
-    samples_over_time,
-)
+from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series, over_frequency, samples_over_time
 from avis_ctrl.measurement.gates.sine_fit import KINDS, SineFit, fit_sine, second_order
 
 
@@ -91,22 +82,21 @@ class SteppedSine(Gate):
 
     name = "stepped sine"
 
-    def look(self, seen: Excerpt, expectation: Expectation) -> SineFit | None:
+    def look(self, seen: Excerpt) -> SineFit | None:
         if seen.header.excitation != "sine" or not seen.driven:
             return None
         piece = seen.first
         return fit_sine(piece.header.name, np.hstack([piece.u, piece.y]), piece.u.shape[1], seen.header.sample_rate_Hz)
 
-    def conclude(self, kept: list[SineFit | None], campaign: Campaign, expectation: Expectation) -> list[Finding]:
+    def conclude(self, kept: list[SineFit | None]) -> list[Finding]:
         fits = sorted((k for k in kept if k is not None), key=lambda k: k.f)
-        names, n_u = (*campaign.u_names, *campaign.y_names), len(campaign.u_names)
+        names, n_u = (*self.campaign.u_names, *self.campaign.y_names), len(self.campaign.u_names)
         if len(fits) < SETTINGS.fewest:
             sentence = (
                 f"No stepped-sine campaign: {len(fits)} sine records, {SETTINGS.fewest} are needed to compare "
                 "neighbours."
             )
-            picture = Picture("Stepped sine", "frequency [Hz]", "ratio to the drive [-]", ())
-            return [Finding(self.name, "ok", sentence, picture=picture)]
+            return [Finding(self.name, "ok", sentence)]
         X = np.array([k.X for k in fits])
         rest = np.array([k.residual_rms for k in fits]) / np.maximum(np.abs(X), 1e-300) * np.sqrt(2)
         silent = [j for j in range(len(names)) if np.median(rest[:, j]) > 10]
