@@ -231,10 +231,7 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
     design, plant = small
     rig = load_rig("avis")
     samples = random_perturbations(plant, 5, 1)
-    controllers = [
-        analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
-        for c in (passive(), classical_skyhook(plant, rig, design))
-    ]
+    controllers = [analyse(design, plant, c, samples) for c in (passive(), classical_skyhook(plant, rig, design))]
     result = partial_result(
         design=design,
         rig=rig,
