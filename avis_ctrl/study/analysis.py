@@ -39,6 +39,8 @@ class AnalysisSettings:
     axis_points : number of frequencies of the lower bound of an axis, in a band of two or three octaves.
     plot_Hz, plot_points : range and number of the frequencies of curves: the modes of a table and a decade on either
         side, about 90 to a decade, so that a resonance is drawn as a curve.
+    samples : number of perturbations for the range of sampled transmissibilities: enough for the picture, the bounds do
+        not depend on it.
     peak_factor : level relative to the r.m.s. [1] that a Gaussian signal of 10 Hz bandwidth exceeds once in ten
         minutes: sqrt(2 ln(f T)), Rice 1944.
     """
@@ -50,6 +52,7 @@ class AnalysisSettings:
     axis_points: int = 24
     plot_Hz: tuple[float, float] = (0.1, 200.0)
     plot_points: int = 300
+    samples: int = 60
     peak_factor: float = float(np.sqrt(2 * np.log(600.0 * 10.0)))
 
 

@@ -14,8 +14,6 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.toml_text import toml_text
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
-__all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
-
 
 @dataclass(frozen=True)
 class PlanSettings:

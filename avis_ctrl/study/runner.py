@@ -18,6 +18,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import DKIteration
 from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.analysis import analyse, worst_of_axis
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
@@ -44,17 +45,6 @@ Progress = Callable[[str], None]
 # Context of the D-K iteration; it gives a function that is called after each step and returns whether to stop.
 Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
-
-
-@dataclass(frozen=True)
-class SampleSettings:
-    """samples : number of perturbations for the range of sampled transmissibilities: enough for the picture, the bounds
-    do not depend on it."""
-
-    samples: int = 60
-
-
-SETTINGS = SampleSettings()
 
 
 def run_design(
@@ -156,7 +146,7 @@ def start_bounds(
     design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
 ) -> dict[str, Future[Any]]:
     """Start the bounds of the other controllers, by name; the skyhook is tuned to the peak that the design requires."""
-    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
+    samples = random_perturbations(plant, ANALYSIS.samples, design.simulation.seed)
     limit, jobs = max(_asked_peaks(design), default=None), {}
     if "skyhook" in design.compare_with and limit is not None:
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples)
@@ -215,7 +205,7 @@ def compare(
 
     Raises ComputationError: the mu controller, or the passive table, could not be analysed.
     """
-    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
+    samples = random_perturbations(plant, ANALYSIS.samples, design.simulation.seed)
     begun = early or {}
     with Workers() as workers:
         jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}

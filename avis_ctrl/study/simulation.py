@@ -80,15 +80,6 @@ def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None
     )
 
 
-def nominal_loop(
-    design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None, companions: Companions | None = None
-) -> SampledLoop:
-    """The design's controller and the loops of the other axes (designed here by default) on the nominal rig."""
-    bare = bare_loop(design, rig, plant, K)
-    companions = companions or design_companions(bare, plant.weights.get("actuator chain *"), design.floor.band_Hz)
-    return replace(bare, loops=companions.systems())
-
-
 @dataclass(frozen=True)
 class SixDofSettings:
     """slowest_Hz : lowest frequency of the check [Hz]: below it geophones measure little but their own noise.
@@ -109,7 +100,8 @@ def six_dof_check(
     The frequencies are those of the design model, lower ones, the ends of the band, and points around the peaks, over
     all frequencies and in the band: a lightly damped mode is narrower than the grid.
     """
-    T2, loop = result.transmissibility, nominal_loop(design, rig, plant, result.K, companions)
+    T2 = result.transmissibility
+    loop = replace(bare_loop(design, rig, plant, result.K), loops=companions.systems())
     kept = [COORDINATES.index(name) for name in design.keep]
     others = [k for k in range(6) if k not in kept]
     known: dict[float, np.ndarray] = {}
