@@ -78,21 +78,11 @@ def doctor() -> None:
         raise typer.Exit(3)
 
 
-for command, name in (
-    (design, "design"),
-    (compare, "compare"),
-    (export, "export"),
-    (identify, "identify"),
-    (gap, "gap"),
-    (predict, "predict"),
-    (gap_axis, "gap-axis"),
-    (excite, "excite"),
-    (simulate_campaign, "simulate-campaign"),
-    (convert, "convert"),
-    (single_axis, "single-axis"),
-    (sweep, "sweep"),
+for command in (
+    *(design, compare, export, identify, gap, predict),
+    *(gap_axis, excite, simulate_campaign, convert, single_axis, sweep),
 ):
-    app.command(name, epilog=LAYOUTS if name in ("identify", "gap", "convert") else None)(command)
+    app.command(epilog=LAYOUTS if command in (identify, gap, convert) else None)(command)
 app.add_typer(new, name="new")
 
 

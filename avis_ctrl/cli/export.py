@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -45,12 +44,14 @@ def export(
     Writes controller.json, avis_controller.h and .c (C99), controller.mat, test_vectors.csv, restart_vectors.csv and
     certificate.json into DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
     """
+    from avis_ctrl import plot
     from avis_ctrl.errors import InputError
     from avis_ctrl.export.design_folder import open_design
     from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
     from avis_ctrl.export.package import FILES, FORMATS, check_package, formats_of, make_package
     from avis_ctrl.files import write_together
     from avis_ctrl.lti.norms import decibels
+    from avis_ctrl.plot.axes import png
     from avis_ctrl.study.files import output_folder
 
     terminal, asked = Terminal(), FORMATS if formats is None else formats_of(formats)
@@ -84,11 +85,15 @@ def export(
             most = mu_asked(folder.design) if mu_at_most is None else mu_at_most
             progress(f"controller of {order} states: descent on mu from the one with {K.nstates} states")
             folder, controller = with_fewer_states(folder, controller, order, progress)
-            pictures[ORDERS] = _picture(folder.added[controller].orders)
+            orders = list(folder.added[controller].orders)
+            title = "mu at most, with the design's model; the last one is exported"
+            pictures[ORDERS] = png(lambda ax: plot.order(orders, ax).set_title(title), 6, 4)
         made = make_package(folder, controller, "float32" if float32 else "float64", asked, progress, most)
         files = write_together(path, pictures | made.contents, [path / name for name in (*FILES, ORDERS)])
     if order is not None:
-        _orders(terminal, folder.added[controller].orders)
+        ends = {len(orders) - 1: "exported", 0: "of the folder"}
+        rows = [(str(states), f"{mu:.4g}", ends.get(k, "")) for k, (states, mu) in enumerate(orders)]
+        terminal.table(("states", "mu at most, design's model", ""), rows, title="order against mu")
     _summary(terminal, made)
     if (mu := made.certificate.content["mu_upper"]) > (allowed := mu_asked(folder.design)):
         terminal.print(f"mu of the code is at most {mu:.4g}; the design requires at most {allowed:g}.")
@@ -100,26 +105,6 @@ def export(
             "add them to keep in the design file."
         )
     terminal.print(f"{len(files)} files in {path}")
-
-
-def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
-    """Plot of mu against controller order (PNG)."""
-    import io
-
-    from matplotlib.figure import Figure
-
-    from avis_ctrl.plot import order
-
-    file, figure = io.BytesIO(), Figure(figsize=(6, 4), layout="constrained")
-    order(list(orders), figure.add_subplot()).set_title("mu at most, with the design's model; the last one is exported")
-    figure.savefig(file, format="png", dpi=150)
-    return file.getvalue()
-
-
-def _orders(terminal: Terminal, orders: Sequence[tuple[int, float]]) -> None:
-    ends = {len(orders) - 1: "exported", 0: "of the folder"}
-    rows = [(str(states), f"{mu:.4g}", ends.get(k, "")) for k, (states, mu) in enumerate(orders)]
-    terminal.table(("states", "mu at most, design's model", ""), rows, title="order against mu")
 
 
 def _anti_windup(choice: Choice) -> str:

@@ -87,7 +87,7 @@ def identify(
         from avis_ctrl.report.identification.content import document
         from avis_ctrl.study.identification import IdentifyOptions, identify
         from avis_ctrl.study.identification_design import design_start
-        from avis_ctrl.study.identification_output import require_readable, write_identification
+        from avis_ctrl.study.identification_output import write_identification
 
         options = IdentifyOptions(
             tuple(parameters or ()),
@@ -103,7 +103,6 @@ def identify(
         found = identify(measured, start, options, progress)
         progress("uncertainty for design")
         try:
-            require_readable(found)
             more, made = design_start(found, template)
             then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
         except AvisError as error:

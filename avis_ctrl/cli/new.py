@@ -189,7 +189,7 @@ def design(
     from avis_ctrl.study.new_files import NewDesign, design_text, new_design
 
     # In a design file, the path of the rig file is relative to the design file.
-    named = os.path.relpath(rig, out.resolve().parent) if _is_file(rig) else rig
+    named = os.path.relpath(rig, out.resolve().parent) if rig.endswith(".toml") or "/" in rig else rig
     given = _design_fields({one.name: ctx.params[one.name] for one in dataclasses.fields(NewDesign)})
     made = new_design(NewDesign(**given), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
@@ -198,10 +198,6 @@ def design(
         f'{out}: written. Next: replace the values marked "Assumed", then run avis design {out} --out '
         f"{out.with_suffix('')}"
     )
-
-
-def _is_file(rig: str) -> bool:
-    return rig.endswith(".toml") or "/" in rig
 
 
 def _numbers(text: str, count: int, field: str) -> tuple[float, ...]:

@@ -28,7 +28,7 @@ from avis_ctrl.export.vectors import agreement_V, as_csv, expected_V, read_csv, 
 from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup
 from avis_ctrl.study.files import as_json
-from avis_ctrl.study.output import controller_form
+from avis_ctrl.study.output import controller_dict
 
 CONTROLLER, CERTIFICATE, MAT = "controller.json", "certificate.json", "controller.mat"
 VECTORS, RESTARTS = "test_vectors.csv", "restart_vectors.csv"
@@ -106,7 +106,7 @@ def make_package(
     content["anti_windup"] = choice.as_dict()
     content["design_inputs_sha256"] = folder.inputs_sha256
     if name in folder.added:
-        contents[CONTINUOUS] = as_json(controller_form(name, folder.added[name].K))
+        contents[CONTINUOUS] = as_json(controller_dict(name, folder.added[name].K))
     if "c" in formats:
         files = c_files(controller, guard, _provenance(folder, controller, certificate))
         contents |= {key: value.encode() for key, value in files.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +26,20 @@ from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_files import write_gap
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identification_design import default_design, default_keep, design_start
-from avis_ctrl.study.identification_output import identified_toml, require_readable, write_identification
+from avis_ctrl.study.identification_output import identified_toml, write_identification
 from avis_ctrl.study.output import FILES, FOLDERS, write_study
 from avis_ctrl.study.verdict import all_axes, first_sentence, requirement_rows
 from avis_ctrl.summary import html_table, wrapped
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class DesignStudy:
     """Result of `design`, as `avis design` computes it: controllers, bounds, simulation, verdict.
 
     result : the complete `DesignResult`.
     """
 
-    def __init__(self, result: DesignResult) -> None:
-        self.result = result
+    result: DesignResult
 
     @property
     def controller(self) -> StateSpace:
@@ -118,14 +119,14 @@ class DesignStudy:
         return html_table(self._rows(), ("requirement", "limit", "result", ""), first_sentence(self.result))
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class IdentificationStudy:
     """Result of `identify`, as `avis identify` computes it: identified table, uncertainty, verdict on held-out records.
 
     found : the complete `Identification`.
     """
 
-    def __init__(self, found: Identification) -> None:
-        self.found = found
+    found: Identification
 
     @property
     def rig(self) -> Rig:
@@ -185,8 +186,8 @@ class IdentificationStudy:
 
         sections : sections of the design that replace the proposed ones. Raises as `design`.
         """
-        require_readable(self.found)
-        return {RIG_FILE: identified_toml(self.found), **design_start(self.found, self._template(sections))[0]}
+        made, _ = design_start(self.found, self._template(sections))
+        return {RIG_FILE: identified_toml(self.found), **made}
 
     def _template(self, sections: Mapping[str, Any] | None) -> Design | None:
         if not sections:
@@ -206,7 +207,6 @@ class IdentificationStudy:
         template, made = self._template(sections), None
         more: dict[str, str] = {}
         try:
-            require_readable(self.found)
             more, made = design_start(self.found, template)
         except AvisError:
             # As in the command: the identification is valid without the design files.
@@ -225,14 +225,14 @@ class IdentificationStudy:
         return html_table(self._rows(), ("parameter", "value +- standard deviation", "unit"), self.rig.name)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class GapStudy:
     """Result of `gap`, as `avis gap` computes it: the verdict, the named effects, both models.
 
     found : the complete `GapFinding`.
     """
 
-    def __init__(self, found: GapFinding) -> None:
-        self.found = found
+    found: GapFinding
 
     @property
     def gap(self) -> Gap:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,16 @@ def axes_of(given: Any, rows: int = 1) -> Any:
     if rows > 1 and np.size(given) != rows:
         raise InputError(f"expected {rows} axes", field="ax", value=np.size(given))
     return given
+
+
+def png(draw: Callable[[Any], Any], width: float, height: float) -> bytes:
+    """What `draw` draws into axes, as the bytes of a PNG file; width, height in inches."""
+    from matplotlib.figure import Figure
+
+    file, figure = io.BytesIO(), Figure(figsize=(width, height), layout="constrained")
+    draw(figure.add_subplot())
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
 
 
 def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -66,14 +65,3 @@ def pareto(
     if title:
         ax.set_title(title, fontsize="medium")
     return finish(ax, labels[0], labels[1], log=False)
-
-
-def pareto_png(values: np.ndarray, labels: Sequence[str], names: Sequence[str] = (), title: str = "") -> bytes:
-    """`pareto` as the bytes of a PNG file."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.2, 4.8), layout="constrained")
-    pareto(values, labels, names, figure.subplots(), title)
-    stored = io.BytesIO()
-    figure.savefig(stored, format="png", dpi=150)
-    return stored.getvalue()

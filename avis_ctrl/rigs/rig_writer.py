@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -15,6 +14,7 @@ from avis_ctrl.rigs.equipment import Ambient, Electronics
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument, PositionSensorAt
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.toml_text import toml_value
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,8 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
     ------
     InputError : a rig of another kind, a comment for a line that does not exist, a comment of several lines.
     """
-    if isinstance(rig, AvisTable):
-        sections = _avis_sections(rig)
-    elif isinstance(rig, Halcyonics):
-        sections = _halcyonics_sections(rig)
-    else:
+    sections = _sections(rig)
+    if not sections:
         raise InputError("expected an AvisTable or a Halcyonics rig", field="rig", value=type(rig).__name__)
     left = dict(comments or {})
     text = "".join(_comment(line) + "\n" for line in header.splitlines())
@@ -61,7 +58,7 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
         for line in lines:
             dotted = f"{name}.{line.key}" if name else line.key
             own = [left.pop(known) for known in (dotted, *line.parameters) if known in left]
-            text += f"{line.key} = {_toml(line.value)}" + (f"  {_comment('; '.join(own))}" if own else "") + "\n"
+            text += f"{line.key} = {toml_value(line.value)}" + (f"  {_comment('; '.join(own))}" if own else "") + "\n"
     if left:
         raise InputError(
             f"the file of the rig {rig.name} has no such line or parameter", field="comments", value=next(iter(left))
@@ -69,21 +66,26 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
     return text
 
 
+def file_keys(rig: Rig) -> dict[str, str]:
+    """Key of the rig file by parameter, such as "isolator.stiffness_N_per_m"; empty for a rig of another kind."""
+    return {
+        parameter: f"{name.partition('[')[0]}.{line.key}"
+        for _, name, lines in _sections(rig)
+        for line in lines
+        for parameter in line.parameters
+    }
+
+
+def _sections(rig: Rig) -> list[_Section]:
+    if isinstance(rig, AvisTable):
+        return _avis_sections(rig)
+    return _halcyonics_sections(rig) if isinstance(rig, Halcyonics) else []
+
+
 def _comment(text: str) -> str:
     if any(not (character.isprintable() or character == "\t") for character in text):
         raise InputError("expected one line of printable characters", field="comments", value=text)
     return f"# {text}".rstrip()
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, str):
-        # JSON strings are TOML strings, except that TOML requires this character to be escaped.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (int, np.integer)):
-        return str(int(value))
-    if isinstance(value, (float, np.floating)):
-        return repr(float(value))
-    return f"[{', '.join(_toml(one) for one in value)}]"
 
 
 def _ambient(ambient: Ambient | None) -> list[_Section]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg as la
@@ -83,30 +83,6 @@ class MuPeak(Shown):
     lower_curve: Array
 
 
-class Stability(Protocol):
-    """Bounds of mu of the blocks without performance: a `MuPeak`, or the part of it that a caller keeps."""
-
-    @property
-    def upper(self) -> float:
-        """Upper bound of mu."""
-
-    @property
-    def lower(self) -> float:
-        """Lower bound of mu."""
-
-    @property
-    def omega(self) -> float:
-        """Frequency [rad/s] of the lower bound."""
-
-    @property
-    def guaranteed(self) -> bool:
-        """Whether the upper bound holds at all frequencies."""
-
-    @property
-    def delta(self) -> Array | None:
-        """Perturbation that attains the lower bound."""
-
-
 # Result of a search at some frequencies: bounds with their proofs.
 Found = TypeVar("Found", UpperBound, WorstGain)
 
@@ -164,7 +140,7 @@ def worst_case_gain(
     *,
     band: Interval = ALL_FREQUENCIES,
     slack: float = SETTINGS.slack,
-    robust: Stability | None = None,
+    robust: MuPeak | None = None,
     points: int = SETTINGS.points,
 ) -> MuPeak:
     """Largest gain from the inputs d to the outputs e of N over all perturbations of norm at most 1.
@@ -392,13 +368,7 @@ def _best_singular(
 
 
 def _worst_case_gain(
-    N: StateSpace,
-    structure: BlockStructure,
-    band: Interval,
-    slack: float,
-    dt: float,
-    known: Stability | None,
-    points: int,
+    N: StateSpace, structure: BlockStructure, band: Interval, slack: float, dt: float, known: MuPeak | None, points: int
 ) -> MuPeak:
     """worst_case_gain of a continuous system, or of the image of a system sampled at dt."""
     accuracy = accuracy_of(slack)
@@ -443,7 +413,7 @@ def _worst_case_gain(
     return MuPeak(np.inf, float(gain[k]), float(omega[k]), delta[k], True, words, omega, upper, gain)
 
 
-def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, omega: Array) -> MuPeak:
+def _destabilised(N: StateSpace, structure: BlockStructure, robust: MuPeak, omega: Array) -> MuPeak:
     """The result if a perturbation of norm at most 1 makes the loop unstable: the worst-case gain is infinite."""
     gain, _ = _gain_of_stable(N.frequency_response(omega), structure, robust)
     return MuPeak(
@@ -459,7 +429,7 @@ def _destabilised(N: StateSpace, structure: BlockStructure, robust: Stability, o
     )
 
 
-def _gain_of_stable(M: Array, structure: BlockStructure, robust: Stability) -> tuple[Array, Array]:
+def _gain_of_stable(M: Array, structure: BlockStructure, robust: MuPeak) -> tuple[Array, Array]:
     """Worst gains (n,) and perturbations (n, n_w, n_z) at each frequency, of a norm that keeps the loop stable."""
     radius = min(1.0, (1 - 1e-9) / robust.upper) if robust.guaranteed else 0.0
     n_z = structure.n_z

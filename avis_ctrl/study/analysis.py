@@ -16,11 +16,11 @@ from avis_ctrl.lti.norms import hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.floor_motion import band_rms, third_octave_midbands, third_octave_rms
 from avis_ctrl.rigs.vibration_criteria import rating
-from avis_ctrl.robust.mu_gain import worst_gain
+from avis_ctrl.robust.mu_gain import perturbed, worst_gain
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak, worst_case_gain
 from avis_ctrl.robust.slycot_adapter import hinf_norm_slicot
 from avis_ctrl.study.design_file import Design
-from avis_ctrl.study.design_result import Bound, ControllerKind, ControllerResult, SiteResponse, Transmissibility
+from avis_ctrl.study.design_result import Bound, Candidate, ControllerResult, SiteResponse, Transmissibility
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
@@ -39,6 +39,8 @@ class AnalysisSettings:
     axis_points : number of frequencies of the lower bound of an axis, in a band of two or three octaves.
     plot_Hz, plot_points : range and number of the frequencies of curves: the modes of a table and a decade on either
         side, about 90 to a decade, so that a resonance is drawn as a curve.
+    samples : number of perturbations for the range of sampled transmissibilities: enough for the picture, the bounds do
+        not depend on it.
     peak_factor : level relative to the r.m.s. [1] that a Gaussian signal of 10 Hz bandwidth exceeds once in ten
         minutes: sqrt(2 ln(f T)), Rice 1944.
     """
@@ -50,32 +52,23 @@ class AnalysisSettings:
     axis_points: int = 24
     plot_Hz: tuple[float, float] = (0.1, 200.0)
     plot_points: int = 300
+    samples: int = 60
     peak_factor: float = float(np.sqrt(2 * np.log(600.0 * 10.0)))
 
 
 SETTINGS = AnalysisSettings()
 
 
-def analyse(
-    design: Design,
-    plant: DesignPlant,
-    K: StateSpace | None,
-    name: str,
-    title: str,
-    kind: ControllerKind,
-    samples: np.ndarray,
-    notes: tuple[str, ...] = (),
-) -> ControllerResult:
-    """Analyse one controller (None: no control) on the design's plant.
+def analyse(design: Design, plant: DesignPlant, candidate: Candidate, samples: np.ndarray) -> ControllerResult:
+    """Analyse one controller on the design's plant.
 
     Parameters
     ----------
     samples : (n_samples, n_w, n_z) perturbations, constant over frequency, for the range of sampled transmissibilities.
 
-    Raises
-    ------
-    ComputationError : the closed loop of the nominal plant is unstable, or a bound cannot be computed.
+    Raises ComputationError: the closed loop of the nominal plant is unstable, or a bound cannot be computed.
     """
+    K = candidate.K
     full = plant.full.closed(K)
     if not full.is_stable():
         fastest_growing = max(full.poles(), key=lambda pole: pole.real)
@@ -100,23 +93,19 @@ def analyse(
     worst_band = worst_case_gain(motion, blocks, band=band, slack=slack, robust=robust, points=few)
     omega = 2 * np.pi * np.geomspace(*SETTINGS.plot_Hz, SETTINGS.plot_points)
     return ControllerResult(
-        name,
-        title,
-        kind,
-        K,
-        full.is_stable(),
-        hinf_norm(nominal).gain,
-        bound(plant, blocks, mu_peak(performance, all_blocks, slack=SETTINGS.slack)),
-        bound(plant, blocks, robust),
-        bound(plant, blocks, worst_peak),
-        bound(plant, blocks, worst_band),
-        transmissibility(motion, blocks, samples, omega),
-        _compliance(plant, full, omega),
-        site_response(plant, full, K is not None, design.floor.band_Hz),
-        hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain,
-        fastest,
-        notes,
-        _by_slicot(nominal),
+        **vars(candidate),
+        stable=full.is_stable(),
+        gamma=hinf_norm(nominal).gain,
+        mu=bound(plant, blocks, mu_peak(performance, all_blocks, slack=SETTINGS.slack)),
+        stability=bound(plant, blocks, robust),
+        worst_peak=bound(plant, blocks, worst_peak),
+        worst_band=bound(plant, blocks, worst_band),
+        transmissibility=transmissibility(motion, blocks, samples, omega),
+        compliance=_compliance(plant, full, omega),
+        site=site_response(plant, full, K is not None, design.floor.band_Hz),
+        peak_transmissibility=hinf_norm(motion.select(slice(n_z, None), slice(n_w, None))).gain,
+        fastest_pole_Hz=fastest,
+        gamma_slicot=_by_slicot(nominal),
     )
 
 
@@ -151,9 +140,7 @@ def _by_slicot(system: StateSpace) -> float | None:
 
 def bound(plant: DesignPlant, blocks: BlockStructure, found: MuPeak) -> Bound:
     """A mu or worst-case result, with its perturbation in words."""
-    words = describe(plant, blocks, found.delta) if found.delta is not None else ()
-    curves = (found.frequencies, found.upper_curve, found.lower_curve)
-    return Bound(found.upper, found.lower, found.omega, found.guaranteed, found.delta, words, *curves)
+    return Bound(**vars(found), words=describe(plant, blocks, found.delta) if found.delta is not None else ())
 
 
 def describe(plant: DesignPlant, blocks: BlockStructure, delta: np.ndarray) -> tuple[str, ...]:
@@ -191,13 +178,8 @@ def transmissibility(
 ) -> Transmissibility:
     """Nominal and sampled transmissibility of a closed loop with inputs (w_delta, floor)."""
     response = motion.frequency_response(omega)
-    n_w, n_z = blocks.n_w, blocks.n_z
-    nominal = response[:, n_z:, n_w:]
-    sampled = []
-    for delta in samples:
-        loop = np.eye(n_z) - response[:, :n_z, :n_w] @ delta
-        T = nominal + response[:, n_z:, :n_w] @ delta @ np.linalg.solve(loop, response[:, :n_z, n_w:])
-        sampled.append(np.linalg.norm(T, ord=2, axis=(1, 2)))
+    nominal = response[:, blocks.n_z :, blocks.n_w :]
+    sampled = [np.linalg.norm(perturbed(response, delta[None]), ord=2, axis=(1, 2)) for delta in samples]
     sigma = np.linalg.norm(nominal, ord=2, axis=(1, 2))
     band = np.array([sigma, *sampled])
     return Transmissibility(omega, nominal, sigma, band.min(axis=0), band.max(axis=0))

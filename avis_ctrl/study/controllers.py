@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -109,22 +110,19 @@ def _reduced(
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
-    def peak(closed: StateSpace, goal: float = 0.0) -> float:
-        return peak_of_loop(closed, blocks, omega, goal)
-
-    K = made.best.K
+    peak, K = partial(peak_of_loop, blocks=blocks, omega=omega), made.best.K
     full = peak(P.closed(K))
     limit = (1 + cost) * full
 
     def harmless(candidate: StateSpace) -> bool:
         closed = P.closed(candidate)
-        return closed.is_stable() and peak(closed, limit) <= limit
+        return closed.is_stable() and peak(closed, goal=limit) <= limit
 
     def lowest_order(start: StateSpace) -> StateSpace:
         # No weight changes below the corner up to which the offset may drift.
         lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
-        return reduce_controller(P.P, start, lambda one: peak(P.closed(one), limit), limit=limit)
+        return reduce_controller(P.P, start, lambda one: peak(P.closed(one), goal=limit), limit=limit)
 
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.

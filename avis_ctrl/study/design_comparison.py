@@ -47,17 +47,15 @@ def compare_designs(first: str | Path, second: str | Path) -> DesignComparison:
     ----------
     first, second : folders written by `avis design` or a design's `save`.
 
-    Raises
-    ------
-    InputError : a folder without such a result, in one line.
+    Raises InputError: a folder without such a result, in one line.
     """
     folders = Path(first), Path(second)
     studies = [read_json(folder / STUDY, "avis-study") for folder in folders]
     results = [read_json(folder / RESULT, "avis-design") for folder in folders]
-    rigs = [dict(_rig_values(study.get("rig"))) for study in studies]
-    asked = [dict(_leaves(study.get("design"), "")) for study in studies]
+    rigs = [_rig_values(study.get("rig")) for study in studies]
+    asked = [_asked(study.get("design")) for study in studies]
     requested = [(f"rig file: {key}", one, other) for key, one, other in _side_by_side(rigs, differing=True)]
-    requested += [row for row in _side_by_side(asked, differing=True) if row[0] != "title"]
+    requested += _side_by_side(asked, differing=True)
     found = list(_side_by_side([_figures(result, folder) for result, folder in zip(results, folders, strict=True)]))
     other = sorted({key.partition(".")[0].partition(":")[0] for key, *_ in requested} & {*WEIGHTS, "rig file"})
     note = (
@@ -83,39 +81,35 @@ def _side_by_side(tables: Sequence[dict[str, Any]], differing: bool = False) -> 
             yield key, _as_text(one), _as_text(other)
 
 
-def _leaves(table: Any, before: str) -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of nested tables."""
-    if not isinstance(table, dict):
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of nested tables; the tables of a list by name, or by number from 1."""
+    if isinstance(value, dict) and not name.endswith("identified"):
+        for key, one in value.items():
+            yield from _leaves(one, f"{name}.{key}" if name else key)
+    elif isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+        for k, one in enumerate(value, 1):
+            yield from _leaves(one, f"{name} {one.get('name', k)}")
+    else:
+        yield name, value
+
+
+def _asked(design: Any) -> dict[str, Any]:
+    """The values of a design by dotted key; those of its requirements by quantity."""
+    if not isinstance(design, dict):
         raise InputError("expected a design", field=STUDY)
-    for key, value in table.items():
-        name = f"{before}{key}"
-        if isinstance(value, dict) and key != "identified":
-            yield from _leaves(value, f"{name}.")
-        elif key == "requirement":
-            for one in value:
-                limit = "at_most" if one.get("at_most") is not None else "at_least"
-                yield f"requirement {one.get('quantity')}, {limit.replace('_', ' ')}", one.get(limit)
-        else:
-            yield name, value
+    asked = dict(_leaves({key: value for key, value in design.items() if key not in ("title", "requirement")}))
+    for one in design.get("requirement", ()):
+        limit = "at_most" if one.get("at_most") is not None else "at_least"
+        asked[f"requirement {one.get('quantity')}, {limit.replace('_', ' ')}"] = one.get(limit)
+    return asked
 
 
-def _rig_values(text: Any) -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of a rig file; the tables of a list by name, or by number from 1."""
-
-    def values(one: Any, name: str) -> Iterator[tuple[str, Any]]:
-        if isinstance(one, dict):
-            for key, value in one.items():
-                yield from values(value, f"{name}.{key}" if name else key)
-        elif isinstance(one, list) and one and all(isinstance(item, dict) for item in one):
-            for k, item in enumerate(one, 1):
-                yield from values(item, f"{name} {item.get('name', k)}")
-        else:
-            yield name, one
-
+def _rig_values(text: Any) -> dict[str, Any]:
+    """The values of a rig file by dotted key."""
     try:
-        yield from values(tomllib.loads(text) if isinstance(text, str) else {"text": text}, "")
+        return dict(_leaves(tomllib.loads(text) if isinstance(text, str) else {"text": text}))
     except tomllib.TOMLDecodeError:
-        yield "text", text
+        return {"text": text}
 
 
 def _figures(result: dict[str, Any], folder: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import Section, read_toml, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
-from avis_ctrl.rigs.rig_sections import LIMITS, Band, ElectronicsSection, Spectrum
+from avis_ctrl.rigs.rig_sections import LIMITS, Band, ElectronicsSection, NotNegative, Positive, Spectrum
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
@@ -29,8 +29,6 @@ def _different(axes: list[str]) -> list[str]:
     return axes
 
 
-Positive = Annotated[float, Field(gt=0, le=LIMITS.largest)]
-NotNegative = Annotated[float, Field(ge=0, le=LIMITS.largest)]
 Percent = Annotated[float, Field(gt=0, lt=100)]
 Decibel = Annotated[float, Field(ge=-200, le=200)]
 Axis = Literal["x", "y", "z", "phi_x", "phi_y", "phi_z"]
@@ -267,9 +265,7 @@ class Design(Section):
 def read_design(path: str | Path) -> Design:
     """Read and check a design file.
 
-    Raises
-    ------
-    InputError : one line naming file, field, value and what was expected.
+    Raises InputError: one line naming file, field, value and what was expected.
     """
     path = Path(path)
     return design_from_table(read_toml(path, "a design file such as designs/avis_z_phix.toml"), path)
@@ -319,9 +315,7 @@ def _require_band_below_crossovers(design: Design) -> None:
 def read_study(path: str | Path) -> tuple[Design, Rig]:
     """Read a design file and its rig: a built-in rig, or a rig file relative to the design file.
 
-    Raises
-    ------
-    InputError : as `read_design`; a rig that is missing or invalid, an uncertain parameter that it does not have.
+    Raises InputError: as `read_design`; a rig that is missing or invalid, an uncertain parameter that it does not have.
     """
     return study_of(read_design(path), Path(path))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import ReductionError
+from avis_ctrl.robust.mu_peak import MuPeak
 from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.at_rest import AtRest
@@ -22,7 +23,7 @@ ControllerKind = Literal["mu", "hinf", "skyhook", "passive"]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A controller to be analysed."""
+    """A controller to be analysed; K None: no control."""
 
     name: str
     title: str
@@ -31,29 +32,14 @@ class Candidate:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class Bound:
-    """Bounds on a supremum over frequency and perturbations.
+@dataclass(frozen=True, eq=False, repr=False)
+class Bound(MuPeak):
+    """Bounds of mu or of a worst-case gain of a design; upper is inf if the set contains an unstable plant.
 
-    Attributes
-    ----------
-    upper, lower : of the supremum; upper is inf if the set contains an unstable plant.
-    omega : frequency [rad/s] of the lower bound.
-    guaranteed : whether the upper bound is valid between the computed frequencies.
-    delta : perturbation (n_w, n_z) that attains the lower bound, or None.
-    words : that perturbation in physical units.
-    frequencies, upper_curve, lower_curve : for plotting (n,).
+    words : the perturbation that attains the lower bound, in physical units.
     """
 
-    upper: float
-    lower: float
-    omega: float
-    guaranteed: bool
-    delta: np.ndarray | None
-    words: tuple[str, ...]
-    frequencies: np.ndarray
-    upper_curve: np.ndarray
-    lower_curve: np.ndarray
+    words: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +80,8 @@ class SiteResponse:
     volts_peak: dict[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class ControllerResult:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ControllerResult(Candidate):
     """A controller and its analysis.
 
     gamma : H-infinity norm of the weighted performance channels of the nominal plant. gamma_slicot : the same by
@@ -108,10 +94,6 @@ class ControllerResult:
     rest : DC gain of the controller alone; None without a controller.
     """
 
-    name: str
-    title: str
-    kind: ControllerKind
-    K: StateSpace | None
     stable: bool
     gamma: float
     mu: Bound
@@ -123,7 +105,6 @@ class ControllerResult:
     site: SiteResponse
     peak_transmissibility: float
     fastest_pole_Hz: float
-    notes: tuple[str, ...] = ()
     gamma_slicot: float | None = None
     rest: AtRest | None = None
 
@@ -231,7 +212,7 @@ class DesignResult:
     loop: Simulated | None
     provenance: dict[str, Any]
     seconds: float
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     failed: tuple[FailedController, ...] = ()
     by_axis: tuple[AxisGain, ...] = ()
     limits: str = ""

@@ -34,9 +34,8 @@ def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz:
 
     It is the difference of two simulations of the linearised table by `gap.simulation`, with and without the effects.
 
-    Raises
-    ------
-    InputError : an effect, place or parameter that does not exist; values outside their range, or without any effect.
+    Raises InputError: an effect, place or parameter that does not exist; values outside their range, or without any
+    effect.
     """
     without = TableModel(ResponseModel.of(truth, (), amplifier_corner_Hz=amplifier_corner_Hz))
     effects = [_active(without, plan, f"effect[{k}]") for k, plan in enumerate(plans, 1)]

@@ -13,7 +13,6 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
-from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spread import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs.avis import AvisTable
@@ -22,10 +21,11 @@ from avis_ctrl.rigs.logical_axes import drivable, sensed
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.rigs.toml_text import toml_text, toml_value
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
+from avis_ctrl.study.identification_output import require_readable
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
-from avis_ctrl.study.toml_text import toml_text, toml_value
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, uncertainty_content, uncertainty_json
 
 if TYPE_CHECKING:
@@ -43,41 +43,30 @@ class DriveUncertaintySettings:
 
 DRIVES = DriveUncertaintySettings()
 # Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
-_COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
-_AVIS: dict[str, Any] = _COMMON | {
-    "loop": {"amplifier_corner_Hz": 300.0},
-    "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}},
-    "transmissibility": {
-        "peak_dB": 3.5,
-        "band_dB": -7.0,
-        "band_Hz": [1.0, 10.0],
-        "transition_octaves": 0.8,
-        "tolerance_dB": 1.0,
-    },
-    "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0, "reduction": 30.0},
-    "synthesis": {"max_iterations": 8, "target_mu": 0.9},
+_COMMON: dict[str, Any] = {
+    "keep": ["z", "phi_x"],
+    "simulation": {"duration_s": 40.0},
     "requirement": [
         {"quantity": "mu_upper", "at_most": 1.0},
         {"quantity": "mu_gap_percent", "at_most": 5.0},
         {"quantity": "worst_case_peak_transmissibility_dB", "at_most": 4.0},
         {"quantity": "worst_case_band_transmissibility_dB", "at_most": -6.0},
-        {"quantity": "fastest_controller_pole_Hz", "at_most": 250.0},
     ],
 }
+_CHAINS = {"low_percent": 10.0, "high_percent": 400.0}
+_EDGES = {"peak_dB": 3.5, "transition_octaves": 0.8, "tolerance_dB": 1.0}
+_AVIS: dict[str, Any] = _COMMON | {
+    "uncertainty": {"actuator_chains": _CHAINS | {"crossover_Hz": 80.0}},
+    "transmissibility": _EDGES | {"band_dB": -7.0, "band_Hz": [1.0, 10.0]},
+    "control_effort": {"floor_velocity_m_per_s": 1e-5, "bandwidth_Hz": 100.0},
+    "synthesis": {"target_mu": 0.9},
+}
 _HALCYONICS: dict[str, Any] = _COMMON | {
-    "loop": {"amplifier_corner_Hz": 300.0, "integrator_corner_Hz": 0.1},
-    "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 150.0, "high_percent": 400.0}},
-    "transmissibility": {
-        "peak_dB": 3.5,
-        "band_dB": -12.0,
-        "band_Hz": [4.0, 16.0],
-        "transition_octaves": 0.8,
-        "tolerance_dB": 1.0,
-    },
-    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 30.0},
+    "uncertainty": {"actuator_chains": _CHAINS | {"crossover_Hz": 150.0}},
+    "transmissibility": _EDGES | {"band_dB": -12.0, "band_Hz": [4.0, 16.0]},
+    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0},
     "floor": {"velocity_rms_m_per_s": 2e-5},
-    "synthesis": {"max_iterations": 8, "target_mu": 0.95},
-    "requirement": _AVIS["requirement"],
+    "synthesis": {"target_mu": 0.95},
 }
 
 
@@ -94,9 +83,11 @@ def design_start(found: Identification, template: Path | Design | None = None) -
 
     Raises
     ------
-    InputError : an invalid template; coordinates that the measured channels cannot drive or distinguish.
+    InputError : an invalid template; coordinates that the measured channels cannot drive or distinguish; identified
+        values that are not a valid rig.
     ComputationError : records in which the actuators cannot be separated, so that no spread can be measured.
     """
+    require_readable(found)
     design = _template(found, template)
     spread = measured_spread(found, tuple(design.keep))
     content = uncertainty_content(found.rig, found.information, [spread], found.provenance)
@@ -113,18 +104,15 @@ def measured_spread(found: Identification, keep: tuple[str, ...]) -> FrfSpread:
     It is restricted to the band that the actuators excite: floor motion below it gives no information on their
     response.
     """
-    measured, band, model = found.measured, found.campaign_fit.band_Hz, _as_written(found.model)
+    measured, band, model = found.measured, found.campaign_fit.band_Hz, found.model
+    # As a rig file has it: the filter of a geophone matches its suspension; the spread covers the rest.
+    model = replace(model, sensors=replace(model.sensors, suspensions=model.sensors.assumed))
     if isinstance(measured, FrequencyResponse):
         return frf_spread(measured.between(*band), model, keep)
     driven = measured.only(tuple(record.header.name for record in measured.records if driven_inputs(record)))
     low, high = excited_band(driven)
     band = max(band[0], low), min(band[1], high)
     return frf_spread(measured_response(driven, model, band, SETTINGS.longest_piece), model, keep)
-
-
-def _as_written(model: ResponseModel) -> ResponseModel:
-    """The model as a rig file has it: the filter of a geophone matches its suspension; the spread covers the rest."""
-    return replace(model, sensors=replace(model.sensors, suspensions=model.sensors.assumed))
 
 
 def identification_design(content: UncertaintyFile, template: Design, rig: Rig) -> str:
@@ -192,14 +180,9 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
     shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
     # A quarter of the sample rate: the hold distorts faster poles.
-    asked = [
-        one | {"at_most": rig.sample_rate_Hz / 4} if one["quantity"] == "fastest_controller_pole_Hz" else one
-        for one in shape["requirement"]
-    ]
-    return design_from_table(
-        shape
-        | {"title": title, "rig": RIG_FILE, "keep": default_keep(rig), "uncertainty": uncertainty, "requirement": asked}
-    )
+    fastest = {"quantity": "fastest_controller_pole_Hz", "at_most": rig.sample_rate_Hz / 4}
+    own = {"title": title, "rig": RIG_FILE, "keep": default_keep(rig), "uncertainty": uncertainty}
+    return design_from_table(shape | own | {"requirement": [*shape["requirement"], fastest]})
 
 
 def assumed_weights(rig: Rig) -> str:

@@ -6,9 +6,10 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
@@ -18,7 +19,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
 from avis_ctrl.rigs.avis import AvisTable
-from avis_ctrl.rigs.file_errors import read_json
+from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -93,40 +94,36 @@ def identified_toml(found: Identification) -> str:
 
 
 def result_dict(found: Identification) -> dict[str, Any]:
-    """Content of result.json: the numerical results."""
+    """Content of result.json for `as_json`: the numerical results."""
     fit, information = found.campaign_fit.fit, found.information
     noise_chi2 = found.campaign_fit.first.chi2_per_dof if found.campaign_fit.measured else None
     start = found.start.parameters()
-    rows = {}
-    for name, value, sigma, unit in zip(
-        information.names, information.values, information.standard_deviation, information.units, strict=True
-    ):
-        rows[name] = {
-            "value": float(value),
-            "std": float(sigma) if np.isfinite(sigma) else None,
-            "unit": unit,
-            "start": float(start[name].value) if name in start else None,
-        }
+    rows = {
+        name: {"value": value, "std": sigma, "unit": unit, "start": start[name].value if name in start else None}
+        for name, value, sigma, unit in zip(
+            information.names, information.values, information.standard_deviation, information.units, strict=True
+        )
+    }
     return {
         "format": "avis-identification",
         "version": 1,
         "rig": found.rig.name,
         "loaded": getattr(found.rig, "load", None) is not None,
         "parameters": rows,
-        "covariance": {"names": list(information.names), "matrix": information.covariance.tolist()},
+        "covariance": {"names": information.names, "matrix": information.covariance},
         "rank": information.rank,
         "condition": information.condition,
-        "identifiability": list(found.identifiability.sentences),
+        "identifiability": found.identifiability.sentences,
         "fit": {
             "chi2_per_dof_of_measured_noise": noise_chi2,
             "dof": fit.dof,
-            "held_at_bounds": list(fit.held),
-            "band_Hz": list(found.campaign_fit.band_Hz),
+            "held_at_bounds": fit.held,
+            "band_Hz": found.campaign_fit.band_Hz,
             "converged": fit.converged,
-            "starts_chi2": list(fit.starts),
-            "notes": list(found.campaign_fit.notes),
+            "starts_chi2": fit.starts,
+            "notes": found.campaign_fit.notes,
         },
-        "advice": list(found.advice),
+        "advice": found.advice,
         "validation": found.validation.as_dict(),
         "gates": [
             values_of(finding, "gate", "severity", "sentence", "channels", "records") for finding in found.findings
@@ -135,8 +132,8 @@ def result_dict(found: Identification) -> dict[str, Any]:
         "amplifier_corner_Hz": found.model.amplifier_corner_Hz,
         "turning": found.model.turning._asdict(),
         "tolerances": [{**one.to_json(), "unit": one.unit} for one in found.campaign_fit.tolerances],
-        "suspensions": {name: list(own) for name, own in found.model.sensors.detuned.items()},
-        "provenance": dict(found.provenance),
+        "suspensions": found.model.sensors.detuned,
+        "provenance": found.provenance,
         "seconds": found.seconds,
     }
 
@@ -162,40 +159,28 @@ def write_identification(
     )
 
 
-def read_identified(folder: Path) -> tuple[Rig, float | None, Turning]:
-    """Rig of an identification's folder, corner of its amplifiers, and how motor and sensor axes turn with the payload.
+class ResultFile(Section, extra="ignore"):
+    """What predictions need of result.json; the defaults are for files of earlier versions.
+
+    turning : how motor and sensor axes turn with the payload. suspensions : corner [Hz] and damping ratio of geophones
+        that differ from those assumed by their filters.
+    """
+
+    loaded: bool = False
+    amplifier_corner_Hz: float | None = None
+    turning: Turning = AS_SIMULATED
+    suspensions: dict[str, Annotated[list[float], Field(min_length=2, max_length=2)]] = {}
+
+
+def read_identified(folder: Path) -> tuple[Rig, ResultFile]:
+    """Rig of an identification's folder, and what else predictions need.
 
     Raises InputError if the folder contains no identification, or an incomplete one.
     """
-    result, path = _result(folder), folder / RESULT_FILE
-    turning = result.get("turning", AS_SIMULATED._asdict())
-    try:
-        turns = Turning(float(turning["motors"]), float(turning["sensors"]))
-    except (KeyError, TypeError, ValueError):
-        raise InputError("expected numbers motors and sensors", file=path, field="turning", value=turning) from None
-    rig = load_rig(folder / RIG_FILE, bool(result.get("loaded")), check=False)
-    return rig, result.get("amplifier_corner_Hz"), turns
-
-
-def _suspended(model: ResponseModel, folder: Path) -> ResponseModel:
-    """The model with the geophone suspensions of an identification. Raises InputError as `read_identified`."""
-    known = _result(folder).get("suspensions", {})
-    if not model.sensors.suspensions:  # ideal sensors
-        return model
-    try:
-        own = tuple(
-            (float(known[name][0]), float(known[name][1])) if name in known else old
-            for name, old in zip(model.sensors.names, model.sensors.suspensions, strict=True)
-        )
-    except (KeyError, IndexError, TypeError, ValueError):
-        raise InputError(
-            "expected corner and damping ratio by name", file=folder / RESULT_FILE, field="suspensions", value=known
-        ) from None
-    return replace(model, sensors=replace(model.sensors, suspensions=own))
-
-
-def _result(folder: Path) -> dict[str, Any]:
-    return read_json(folder / RESULT_FILE, "avis-identification", "the folder of avis identify or avis gap")
+    path = folder / RESULT_FILE
+    content = read_json(path, "avis-identification", "the folder of avis identify or avis gap")
+    found = validated(ResultFile, content, path)
+    return load_rig(folder / RIG_FILE, found.loaded, check=False), found
 
 
 def write_predictions(
@@ -210,11 +195,16 @@ def write_predictions(
     InputError : a folder or campaign that does not fit, a path that cannot be written.
     ComputationError : the disk cannot store the file.
     """
-    rig, corner, turning = read_identified(folder)
-    model = replace(
-        ResponseModel.of(rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, corner), turning=turning
+    rig, known = read_identified(folder)
+    model = ResponseModel.of(
+        rig, (), campaign.y_unit, campaign.y_names, campaign.u_names, True, known.amplifier_corner_Hz
     )
-    model = _suspended(model, folder)
+    sensors, own = model.sensors, known.suspensions
+    suspensions = tuple(
+        (own[name][0], own[name][1]) if name in own else old
+        for name, old in zip(sensors.names, sensors.suspensions, strict=False)  # ideal sensors have none
+    )
+    model = replace(model, turning=known.turning, sensors=replace(sensors, suspensions=suspensions))
     limits = rig.converter.limits_V if campaign.y_unit == "V" and rig.converter else None
     with replacing(out) as file:
         file.attrs.update({"format": "avis-prediction", "version": 1, "rig": rig.name})

@@ -83,9 +83,7 @@ def in_design(
     declared, factor : the design's own relative uncertainty of its drives, and a factor that makes it valid for all
         coordinates together.
 
-    Raises
-    ------
-    InputError : a rig other than the identified one, coordinates or a confidence that the file does not contain.
+    Raises InputError: a rig other than the identified one, coordinates or a confidence that the file does not contain.
     """
     content.check_rig(rig)
     spread = next((one for one in content.spread if sorted(one.keep) == sorted(keep)), None)

@@ -19,7 +19,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.hinfsyn import hinf_suboptimal, hinfsyn
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
 from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
-from avis_ctrl.study.design_result import Bound, ControllerResult
+from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -261,12 +261,12 @@ def _part(plant: DesignPlant, name: str, omega: float) -> str:
     return ""
 
 
-def _peak(bound: Bound | MuPeak) -> float:
+def _peak(bound: MuPeak) -> float:
     """Frequency [rad/s] of the largest upper bound; `omega` is that of the lower bound."""
     return float(bound.frequencies[np.argmax(bound.upper_curve)])
 
 
-def _unproved(bound: Bound | MuPeak) -> str:
+def _unproved(bound: MuPeak) -> str:
     """Words for an upper bound that is not proved between the computed frequencies."""
     return "" if bound.guaranteed else " at the computed frequencies"
 

@@ -39,9 +39,7 @@ def tuned_loops(
     They are found by descent on the peak of mu, from the diagonal part of the controller K or from the classical
     skyhook. The states are allotted to the axes that need them, `settings.states` per axis on average.
 
-    Raises
-    ------
-    ComputationError : no starting point stabilises the nominal plant, or the gain of the table is unbounded.
+    Raises ComputationError: no starting point stabilises the nominal plant, or the gain of the table is unbounded.
     """
     P, skyhook = plant.synthesis, classical_loops(plant, rig, design).controller()
     task = Task(P.P, P.all_blocks.complexified(), decentralised=True, limit=gain_limit(plant, rig.sample_rate_Hz))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +55,8 @@ class NewRig:
 def rig_text(new: NewRig) -> str:
     """The text of the rig file.
 
-    Raises
-    ------
-    InputError : not 3 or 4 mounts, a size, mass or frequency that is not positive, an invalid name, other sensors, a
-        RESP file that cannot be read or contradicts itself.
+    Raises InputError: not 3 or 4 mounts, a size, mass or frequency that is not positive, an invalid name, other
+    sensors, a RESP file that cannot be read or contradicts itself.
     """
     if new.sensors not in ("geophone", "accelerometer"):
         raise InputError("expected geophone or accelerometer", field="sensors", value=new.sensors)
@@ -66,16 +64,9 @@ def rig_text(new: NewRig) -> str:
         raise InputError("expected no RESP file of a geophone for accelerometers", field="geophone", value=new.geophone)
     if new.mounts not in (3, 4):
         raise InputError("expected 3 or 4; add further mounts to the file afterwards", field="mounts", value=new.mounts)
-    for field in (
-        "mass_kg",
-        "vertical_Hz",
-        "horizontal_Hz",
-        "damping",
-        "constant_N_per_V",
-        "limit_V",
-        "sample_rate_Hz",
-    ):
-        require_positive(getattr(new, field), field)
+    for one in fields(new):
+        if one.type == "float":
+            require_positive(getattr(new, one.name), one.name)
     if len(new.size_m) != 3 or not all(0 < side <= LIMITS.farthest_m for side in new.size_m):
         raise InputError(
             f"expected three positive lengths in metres, at most {LIMITS.farthest_m:g}",
@@ -129,9 +120,7 @@ def rig_text(new: NewRig) -> str:
 def rig_of(new: NewRig) -> Rig:
     """The table of a new rig file. Warns of unusual answers.
 
-    Raises
-    ------
-    InputError : answers that no real table has; the message names the likely unit error. See also `rig_text`.
+    Raises InputError: answers that no real table has; the message names the likely unit error. See also `rig_text`.
     """
     answers = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(new).items()}
     if unusual := plausible(answers, rig_from, written=_content):
@@ -208,9 +197,7 @@ class NewDesign:
 def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
     """The design, validated.
 
-    Raises
-    ------
-    InputError : a coordinate that the drives cannot move or the sensors cannot measure; an invalid band or range.
+    Raises InputError: a coordinate that the drives cannot move or the sensors cannot measure; an invalid band or range.
     """
     known = rig.parameters()
     spreads = {"mass": new.mass_percent, "isolator*.k_*": new.stiffness_percent, "isolator*.c_*": new.damping_percent}

@@ -22,16 +22,10 @@ FILES = STUDY, "plant.json", "sampled_controller.json", "report.html", "report.p
 FOLDERS = ("controllers",)
 
 
-def controller_dict(result: ControllerResult) -> dict[str, Any]:
-    """A controller in the avis-controller format of the contract."""
-    K = result.K
+def controller_dict(name: str, K: StateSpace | None) -> dict[str, Any]:
+    """A controller of the logical axes in the avis-controller format of the contract. Raises InputError for None."""
     if K is None:
-        raise InputError("a passive rig has no controller", field="controller", value=result.name)
-    return controller_form(result.name, K)
-
-
-def controller_form(name: str, K: StateSpace) -> dict[str, Any]:
-    """A controller of the logical axes in the avis-controller format of the contract."""
+        raise InputError("a passive rig has no controller", field="controller", value=name)
     return {
         "format": "avis-controller",
         "version": 1,
@@ -116,12 +110,9 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """Row of a controller that could not be analysed; the note has the reason."""
-    unknown = (
-        *("gamma", "mu_upper", "mu_lower", "mu_peak_Hz"),
-        *("peak_transmissibility_dB", "worst_case_peak_transmissibility_dB", "at_rest"),
-    )
-    known = {"name": c.name, "kind": c.kind, "file": None, "order": None, "stable": False}
-    return {**known, **dict.fromkeys(unknown), "note": c.reason}
+    figures = "gamma mu_upper mu_lower mu_peak_Hz peak_transmissibility_dB worst_case_peak_transmissibility_dB"
+    unknown = dict.fromkeys(["file", "order", *figures.split(), "at_rest"])
+    return {"name": c.name, "kind": c.kind, "stable": False, **unknown, "note": c.reason}
 
 
 def _all_axes(loop: Simulated | None) -> dict[str, Any]:
@@ -162,7 +153,9 @@ def sampled_controller_dict(result: DesignResult, loop: Simulated) -> dict[str, 
 def write_study(result: DesignResult, folder: Path, html: bytes | None = None, pdf: bytes | None = None) -> list[Path]:
     """Write all files of a study or none; result.json is last, so its presence shows that the others are complete."""
     contents = {
-        f"controllers/{c.name}.json": as_json(controller_dict(c)) for c in result.controllers if c.K is not None
+        f"controllers/{c.name}.json": as_json(controller_dict(c.name, c.K))
+        for c in result.controllers
+        if c.K is not None
     }
     if result.loop is not None:
         contents["sampled_controller.json"] = as_json(sampled_controller_dict(result, result.loop))

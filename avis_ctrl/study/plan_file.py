@@ -11,10 +11,8 @@ from typing import Any, Literal
 
 from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.toml_text import toml_text
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
-from avis_ctrl.study.toml_text import toml_text
-
-__all__ = ["CampaignPlan", "default_plan", "plan_from_table", "plan_toml", "read_plan"]
 
 
 @dataclass(frozen=True)
@@ -34,9 +32,7 @@ SETTINGS = PlanSettings()
 def read_plan(path: str | Path) -> CampaignPlan:
     """Read and check a plan.
 
-    Raises
-    ------
-    InputError : one line naming file, field, value and what was expected.
+    Raises InputError: one line naming file, field, value and what was expected.
     """
     path = Path(path)
     return plan_from_table(read_toml(path, "a campaign plan with [[record]] sections"), path)

@@ -129,10 +129,8 @@ def build_plant(
     wiring : of a controller made for another rig; by default that for this rig. fit : uncertain elements in addition to
         those of the design. gravity : whether the sensors of horizontal motion measure the tilt of the kept axes.
 
-    Raises
-    ------
-    InputError : parameters or axes that the rig does not have, axes that its actuators cannot drive or its sensors
-        cannot separate; an identification of another rig or other coordinates.
+    Raises InputError: parameters or axes that the rig does not have, axes that its actuators cannot drive or its
+    sensors cannot separate; an identification of another rig or other coordinates.
     """
     identified = _identified(design, rig)
     directions = identified.directions if identified else ()

@@ -8,7 +8,6 @@ kind of parameter of the rig. The error whose correction makes records and model
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -24,6 +23,7 @@ from avis_ctrl.measurement.gates import Finding
 from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, usable
 from avis_ctrl.rigs.plausible_ranges import RANGES, Range
+from avis_ctrl.rigs.rig_writer import file_keys
 
 
 @dataclass(frozen=True)
@@ -65,27 +65,6 @@ SETTINGS = RecordPlausibility()
 # Likely wrong field, its present value, what was probably meant; a candidate has the remaining distance in front.
 Question = tuple[str, object, str]
 Candidate = tuple[float, str, object, str]
-# Fields of rig files by parameter name; other parameters are named by themselves.
-FIELDS = {
-    "mass": "payload.mass_kg",
-    "J": "payload.inertia_kgm2",
-    "Ixx": "payload.inertia_kgm2",
-    "Iyy": "payload.inertia_kgm2",
-    "Izz": "payload.inertia_kgm2",
-    "isolator.k": "isolator.stiffness_N_per_m",
-    "isolator.c": "isolator.damping_Ns_per_m",
-    "actuator": "actuators.constant_N_per_V",
-    "e": "actuators.constant_N_per_V",
-    "k_s": "suspension.k_s_N_per_m",
-    "k_a": "suspension.k_a_N_per_m",
-    "k_t": "suspension.k_t_N_per_m",
-    "k_r": "suspension.k_r_Nm_per_rad",
-    "d1": "suspension.d1_Ns_per_m",
-    "d3": "suspension.d3_Ns_per_m",
-    "d4": "suspension.d4_Nms_per_rad",
-    "d5": "suspension.d5_Nms_per_rad",
-    "d6": "suspension.d6_Nms_per_rad",
-}
 # Units of the rig parameters that are tried. Factors of a channel's gain are not among them, because an error of one of
 # them cannot be distinguished from an error of another.
 UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
@@ -152,9 +131,7 @@ def check_records(measured: Campaign, model: ResponseModel) -> tuple[Finding, ..
 
     Returns warnings on sensors that are off by one factor in all bands; these do not stop the analysis.
 
-    Raises
-    ------
-    InputError : one line that names the field and the likely error.
+    Raises InputError: one line that names the field and the likely error.
     """
     seen = record_spectra(measured)
     if seen is None:
@@ -320,13 +297,13 @@ class UnitErrors:
                     yield distance(decades - c) + SETTINGS.scope, "unit of y", unit, f"did you mean {other}{much}?"
 
     def _of_rig(self) -> Iterator[Candidate]:
-        """Errors of each kind of rig parameter; all parameters of a kind have the same factor."""
-        known = self.model.rig.parameters()
+        """Errors of each key of the rig file; all its parameters have the same factor, as all moments of inertia do."""
+        known, keys = self.model.rig.parameters(), file_keys(self.model.rig)
         kinds: dict[str, list[str]] = {}
         for name, parameter in known.items():
             if parameter.unit in UNITS and parameter.value:
-                kinds.setdefault(_kind(name), []).append(name)
-        for kind, names in kinds.items():
+                kinds.setdefault(keys.get(name, name).replace("_offdiagonal", ""), []).append(name)
+        for field, names in kinds.items():
             for factor in SETTINGS.rig_factors:
                 try:
                     rig = self.model.rig.with_parameters({name: factor * known[name].value for name in names})
@@ -336,7 +313,7 @@ class UnitErrors:
                 value, decades = known[names[0]].value, float(np.log10(factor))
                 much = f"{'a thousand' if abs(decades) == 3 else 'a million'} times {'more' if factor > 1 else 'less'}"
                 left = distance(self.seen.decades(moved)) + SETTINGS.scope + _rare(decades)
-                yield left, FIELDS.get(kind, kind), value, f"did you mean {value * factor:g} ({much})?"
+                yield left, field, value, f"did you mean {value * factor:g} ({much})?"
 
     def _sensor_gain(self, name: str, factor: float) -> Question:
         sensors = self.model.sensors
@@ -399,14 +376,3 @@ class UnitErrors:
 
 def _rare(decades: float) -> float:
     return SETTINGS.rare * (abs(decades) != 3)
-
-
-def _kind(name: str) -> str:
-    """Kind of a parameter: isolator3.k_x and isolator1.k_z are one kind, J1 .. J23 another, d1 and d3 two kinds."""
-    if re.fullmatch(r"d\d", name):
-        return name
-    if re.fullmatch(r"I[xyz]{2}|J\d+", name):
-        return "J"
-    if name.startswith("actuator."):
-        return "actuator"
-    return re.sub(r"_[xyz]$", "", re.sub(r"\d+", "", name))

@@ -43,9 +43,7 @@ def check_campaign(
     despite_gates : continue if a check reports a stop. named_later : gates whose findings the caller's own analysis
         names; they neither stop it nor are they reported here.
 
-    Raises
-    ------
-    InputError : units or levels that no such table produces; a gate that reports a stop.
+    Raises InputError: units or levels that no such table produces; a gate that reports a stop.
     """
     findings = (*records_fit(measured, model, despite_gates, progress), *examine(measured, expectation(model)))
     grave = [one for one in findings if one.severity in ("warning", "stop") and one.gate not in named_later]

@@ -39,10 +39,8 @@ def with_rig_names(
 
     columns : the mapping used to read the file; columns of a variable that it names may be numbered, too.
 
-    Raises
-    ------
-    InputError : channels that the rig does not have; the message explains how to name them and which rig the file
-        names. Records of another sample rate than the rig's.
+    Raises InputError: channels that the rig does not have; the message explains how to name them and which rig the file
+    names. Records of another sample rate than the rig's.
     """
     of_rig = {"u": tuple(rig.equations_of_motion().actuators), "y": tuple(rig.sensor_rows()[0])}
     if isinstance(measured, FrequencyResponse):

@@ -32,9 +32,7 @@ def gain_limit(plant: DesignPlant, sample_rate_Hz: float, settings: RollOffSetti
     gain of the continuous-time controller plus `held` times this gain, the part that passes the hold. At half the
     sample rate the image coincides with the signal and counts twice.
 
-    Raises
-    ------
-    ComputationError : a table without a bounded gain over the uncertainty set.
+    Raises ComputationError: a table without a bounded gain over the uncertainty set.
     """
     blocks, P, u, y = plant.full.blocks, plant.full.P, plant.full.u, plant.full.y
     omega = np.geomspace(1.0, settings.beyond, settings.points) * np.pi * sample_rate_Hz

@@ -14,18 +14,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import DKIteration
 from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
+from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.analysis import analyse, worst_of_axis
 from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import (
     AxisGain,
-    Bound,
     Candidate,
     ControllerResult,
     DesignResult,
@@ -48,17 +47,6 @@ Stop = AbstractContextManager[Callable[[], bool]]
 NEVER: Stop = nullcontext(lambda: False)
 
 
-@dataclass(frozen=True)
-class SampleSettings:
-    """samples : number of perturbations for the range of sampled transmissibilities: enough for the picture, the bounds
-    do not depend on it."""
-
-    samples: int = 60
-
-
-SETTINGS = SampleSettings()
-
-
 def run_design(
     design: Design, rig: Rig, progress: Progress = lambda text: None, source: Path | None = None, stop: Stop = NEVER
 ) -> DesignResult:
@@ -73,13 +61,41 @@ def run_design(
     began = time.monotonic()
     progress("model: rig, uncertainty, weights")
     plant = build_plant(design, rig)
-    # Computations that do not depend on the mu controller run in parallel with the D-K iteration.
-    with Workers(beside=True) as workers:
-        others, failed = other_controllers(design, plant, rig, progress)
-        early = start_bounds(design, plant, rig, others, workers)
-        mu, synthesis = synthesise(design, plant, rig, others, progress, stop)
-        compared = compare(design, plant, rig, [mu, *others], failed, progress, early)
-    return finish(design, plant, rig, synthesis, compared, time.monotonic() - began, source)
+    with threadpool_limits(1):
+        # Computations that do not depend on the mu controller run in parallel with the D-K iteration.
+        with Workers(beside=True) as workers:
+            others, failed = other_controllers(design, plant, rig, progress)
+            early = start_bounds(design, plant, rig, others, workers)
+            candidate, synthesis = synthesise(design, plant, rig, others, progress, stop)
+            compared = compare(design, plant, rig, [candidate, *others], failed, progress, early)
+        reduction = reduction_error(rig, design.keep)
+        controllers, companions = compared.controllers, compared.loop.companions
+        mu = next(c for c in controllers if c.name == "mu")
+        six_dof = six_dof_check(design, rig, plant, mu, companions)
+        assumed = plant.identified.assumption if plant.identified else ""
+        limits = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else limiting(plant, mu)
+        unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
+        passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in companions.passive]
+        notes = tuple(text for text in (assumed, *unlike, *passive_axes, *companions.remarks()) if text)
+        requirements = (
+            *check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
+            *check_requirements(design, controllers, compared.by_axis),
+        )
+    seconds = time.monotonic() - began
+    return DesignResult(
+        design,
+        rig,
+        plant,
+        dk_history=synthesis.history,
+        requirements=requirements,
+        reduction=reduction,
+        six_dof=six_dof,
+        provenance=design_provenance(design, source, rig, seconds),
+        seconds=seconds,
+        notes=notes,
+        limits=limits,
+        **vars(compared),
+    )
 
 
 # Controllers from which the D-K iteration starts, by their kind in its history.
@@ -115,36 +131,26 @@ def other_controllers(
     """
     made: list[Candidate] = []
     failed: list[FailedController] = []
-    with threadpool_limits(1):
-        if "hinf" in design.compare_with:
-            progress("H-infinity synthesis of the nominal plant")
-            try:
-                made.append(nominal_hinf(design, plant, rig))
-            except ComputationError as error:
-                failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
-        if "skyhook_classical" in design.compare_with:
-            made.append(classical_skyhook(plant, rig, design))
+    if "hinf" in design.compare_with:
+        progress("H-infinity synthesis of the nominal plant")
+        try:
+            made.append(nominal_hinf(design, plant, rig))
+        except ComputationError as error:
+            failed.append(FailedController("hinf", "H-infinity, nominal", "hinf", str(error)))
+    if "skyhook_classical" in design.compare_with:
+        made.append(classical_skyhook(plant, rig, design))
     return [*made, passive()], failed
-
-
-@dataclass(frozen=True)
-class PendingBounds:
-    """Bounds in progress, by controller, and the allowed worst-case peak of the tuned skyhook among them."""
-
-    bounds: Mapping[str, Future[Any]]
-    peak_limit: float | None
 
 
 def start_bounds(
     design: Design, plant: DesignPlant, rig: Rig, others: Sequence[Candidate], workers: Workers
-) -> PendingBounds:
-    """Start the bounds of the other controllers; the skyhook is tuned to the peak that the design requires."""
-    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
-    limit = max(_asked_peaks(design), default=None) if "skyhook" in design.compare_with else None
-    jobs = {}
-    if limit is not None:
+) -> dict[str, Future[Any]]:
+    """Start the bounds of the other controllers, by name; the skyhook is tuned to the peak that the design requires."""
+    samples = random_perturbations(plant, ANALYSIS.samples, design.simulation.seed)
+    limit, jobs = max(_asked_peaks(design), default=None), {}
+    if "skyhook" in design.compare_with and limit is not None:
         jobs["skyhook"] = workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples)
-    return PendingBounds(jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}, limit)
+    return jobs | {c.name: workers.submit(_measured, design, plant, c, samples) for c in others}
 
 
 def synthesise(
@@ -156,69 +162,25 @@ def synthesise(
     stop: Stop = NEVER,
 ) -> tuple[Candidate, DKIteration]:
     """The mu controller and its D-K iteration, which starts from the best of the other controllers."""
-    with threadpool_limits(1):
 
-        def shown(row: Any) -> bool:
-            """Called after each iteration; False stops it."""
-            ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
-            reached = f"peak mu {row.mu_upper:.5g}, order {row.order}"
-            # Numbered as in the report, where the initial controllers are rows of the same table.
-            if row.kind in INITIAL:
-                progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): {reached}")
-            else:
-                progress(
-                    f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, {reached}, "
-                    f"misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
-                )
-            return not ends
+    def shown(row: Any) -> bool:
+        """Called after each iteration; False stops it."""
+        ends = enough()  # before the line: once it is visible, Ctrl-C keeps this controller
+        reached = f"peak mu {row.mu_upper:.5g}, order {row.order}"
+        # Numbered as in the report, where the initial controllers are rows of the same table.
+        if row.kind in INITIAL:
+            progress(f"step {row.iteration}, initial controller ({INITIAL[row.kind]}): {reached}")
+        else:
+            progress(
+                f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, {reached}, "
+                f"misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
+            )
+        return not ends
 
-        with stop as enough:
-            mu, made = mu_optimal(design, plant, rig, shown, others)
-        progress(mu.notes[-1])
-        return mu, made
-
-
-def finish(
-    design: Design,
-    plant: DesignPlant,
-    rig: Rig,
-    synthesis: DKIteration,
-    compared: Comparison,
-    seconds: float,
-    source: Path | None = None,
-) -> DesignResult:
-    """The verdict, the error of the reduction to the kept axes, and the provenance."""
-    controllers = compared.controllers
-    with threadpool_limits(1):
-        reduction = reduction_error(rig, design.keep)
-        mu = next(c for c in controllers if c.name == "mu")
-        six_dof = six_dof_check(design, rig, plant, mu, compared.loop.companions)
-        assumed = plant.identified.assumption if plant.identified else ""
-        limits = best_found(plant, mu, controllers) if mu.mu.upper >= 1 else limiting(plant, mu)
-        unlike = [f"{one.title!r} is missing from the comparison: {one.reason}" for one in compared.failed]
-        passive_axes = [f"The axis {axis} remains passive: {why}." for axis, why in compared.loop.companions.passive]
-        notes = tuple(text for text in (assumed, *unlike, *passive_axes, *compared.loop.companions.remarks()) if text)
-    requirements = (
-        *check_loop(compared.loop.check, compared.loop.rest, design.control_effort.offset_percent),
-        *check_requirements(design, controllers, compared.by_axis),
-    )
-    return DesignResult(
-        design,
-        rig,
-        plant,
-        controllers,
-        synthesis.history,
-        requirements,
-        reduction,
-        six_dof,
-        compared.loop,
-        design_provenance(design, source, rig, seconds),
-        seconds,
-        notes,
-        compared.failed,
-        compared.by_axis,
-        limits,
-    )
+    with stop as enough:
+        mu, made = mu_optimal(design, plant, rig, shown, others)
+    progress(mu.notes[-1])
+    return mu, made
 
 
 ORDER = ("passive", "skyhook_classical", "skyhook", "loops", "hinf", "mu")
@@ -231,7 +193,7 @@ def compare(
     candidates: Sequence[Candidate],
     failed: Sequence[FailedController] = (),
     progress: Progress = lambda text: None,
-    early: PendingBounds | None = None,
+    early: Mapping[str, Future[Any]] | None = None,
 ) -> Comparison:
     """Bounds of every controller, of the tuned loops and the tuned skyhook if required, and the simulation of mu.
 
@@ -241,12 +203,10 @@ def compare(
 
     early : bounds that were started before, on processes with a lower priority than those for the mu controller.
 
-    Raises
-    ------
-    ComputationError : the mu controller, or the passive table, could not be analysed.
+    Raises ComputationError: the mu controller, or the passive table, could not be analysed.
     """
-    samples = random_perturbations(plant, SETTINGS.samples, design.simulation.seed)
-    begun = early.bounds if early is not None else {}
+    samples = random_perturbations(plant, ANALYSIS.samples, design.simulation.seed)
+    begun = early or {}
     with Workers() as workers:
         jobs = {begun.get(c.name) or workers.submit(_measured, design, plant, c, samples): c.name for c in candidates}
         if "loops" in design.compare_with:
@@ -272,15 +232,12 @@ def compare(
         mu = best_of(mu, [one for one in found.values() if isinstance(one, ControllerResult)])
         simulation = workers.submit(simulate_study, design, rig, plant, mu)
         axes = range(len(plant.axes))
-        by_axis = [workers.submit(_worst_of_axis, design, plant, k, mu.K, mu.stability) for k in axes]
+        by_axis = [workers.submit(worst_of_axis, design, plant, k, mu.K, mu.stability) for k in axes]
         jobs = {}
         if "skyhook" in design.compare_with:
             limit = skyhook_limit(design, mu)
-            jobs = {
-                begun["skyhook"]
-                if early is not None and limit == early.peak_limit
-                else workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"
-            }
+            tuning = begun.get("skyhook") if limit in _asked_peaks(design) else None
+            jobs = {tuning or workers.submit(_tuned, design, plant, rig, "skyhook", limit, samples): "skyhook"}
         gather()
         loop = simulation.result()
         proved = [one.result() for one in by_axis]
@@ -289,11 +246,11 @@ def compare(
         if isinstance(skyhook := found.get("skyhook"), ControllerResult) and best_of(mu, [skyhook]) is not mu:
             found["mu"] = mu = best_of(mu, [skyhook])
             loop = simulate_study(design, rig, plant, mu)
-            proved = [_worst_of_axis(design, plant, k, mu.K, mu.stability) for k in axes]
+            proved = [worst_of_axis(design, plant, k, mu.K, mu.stability) for k in axes]
         rival = [np.nan for _ in axes]
         if isinstance(skyhook, ControllerResult):
             stable = np.isfinite(skyhook.worst_peak.upper)
-            rival = [_worst_of_axis(design, plant, k, skyhook.K) if stable else np.inf for k in axes]
+            rival = [worst_of_axis(design, plant, k, skyhook.K) if stable else np.inf for k in axes]
     if isinstance(rest := found["passive"], FailedController):
         raise ComputationError(f"the table without control could not be analysed: {rest.reason}")
     every = [*failed, *(one for one in found.values() if isinstance(one, FailedController))]
@@ -310,21 +267,13 @@ def compare(
     )
 
 
-def _worst_of_axis(
-    design: Design, plant: DesignPlant, axis: int, K: StateSpace | None, stability: Bound | None = None
-) -> float:
-    with threadpool_limits(1):
-        return worst_of_axis(design, plant, axis, K, stability)
-
-
 def _measured(
     design: Design, plant: DesignPlant, c: Candidate, samples: np.ndarray
 ) -> ControllerResult | FailedController:
-    with threadpool_limits(1):
-        try:
-            return analyse(design, plant, c.K, c.name, c.title, c.kind, samples, c.notes)
-        except ComputationError as error:
-            return FailedController(c.name, c.title, c.kind, str(error))
+    try:
+        return analyse(design, plant, c, samples)
+    except ComputationError as error:
+        return FailedController(c.name, c.title, c.kind, str(error))
 
 
 def _tuned(
@@ -332,12 +281,11 @@ def _tuned(
 ) -> ControllerResult | FailedController:
     """given : allowed peak of the skyhook, or the controller from which the loops start."""
     make, title = (tuned_skyhook, "skyhook, tuned") if name == "skyhook" else (tuned_loops, LOOPS_TITLE)
-    with threadpool_limits(1):
-        try:
-            candidate = make(plant, rig, design, given)
-        except ComputationError as error:
-            return FailedController(name, title, "skyhook", str(error))
-        return _measured(design, plant, candidate, samples)
+    try:
+        candidate = make(plant, rig, design, given)
+    except ComputationError as error:
+        return FailedController(name, title, "skyhook", str(error))
+    return _measured(design, plant, candidate, samples)
 
 
 def skyhook_limit(design: Design, mu: ControllerResult) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from avis_ctrl.lti.statespace import StateSpace, append, gain
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel
@@ -35,31 +34,30 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
 
     The loops of the other axes are designed here, around this controller and for this rig's sensors.
     """
-    with threadpool_limits(1):
-        bare = bare_loop(design, rig, plant, result.K)
-        errors = plant.weights.get("actuator chain *")
-        perturbed = list(perturbed_loops(design, rig, plant, result, bare))
-        companions = until_stable(design_companions(bare, errors, design.floor.band_Hz), [bare, *perturbed])
-        loops = [replace(one, loops=companions.systems()) for one in (bare, *perturbed)]
-        rest = at_rest(loops[0])
-        # The offsets that use the largest part of a drive's range; with an integrating controller there is no
-        # equilibrium.
-        offset = (
-            [replace(one, sensors=replace(one.sensors, offset_V=rest.worst_offset_V)) for one in loops]
-            if np.isfinite(rest.percent)
-            else loops
-        )
-        check = check_designs(offset, design.simulation.duration_s, design.simulation.seed)
-        unstable = [loop for loop, one in zip(loops, check.plants, strict=True) if not one.stable]
-        nominal = loops[0]
-        return Simulated(
-            companions,
-            check,
-            digital_controller(nominal),
-            nominal.loop_delay_s * nominal.sample_rate_Hz,
-            find_culprit(unstable[0]) if unstable else None,
-            rest,
-        )
+    bare = bare_loop(design, rig, plant, result.K)
+    errors = plant.weights.get("actuator chain *")
+    perturbed = list(perturbed_loops(design, rig, plant, result, bare))
+    companions = until_stable(design_companions(bare, errors, design.floor.band_Hz), [bare, *perturbed])
+    loops = [replace(one, loops=companions.systems()) for one in (bare, *perturbed)]
+    rest = at_rest(loops[0])
+    # The offsets that use the largest part of a drive's range; with an integrating controller there is no
+    # equilibrium.
+    offset = (
+        [replace(one, sensors=replace(one.sensors, offset_V=rest.worst_offset_V)) for one in loops]
+        if np.isfinite(rest.percent)
+        else loops
+    )
+    check = check_designs(offset, design.simulation.duration_s, design.simulation.seed)
+    unstable = [loop for loop, one in zip(loops, check.plants, strict=True) if not one.stable]
+    nominal = loops[0]
+    return Simulated(
+        companions,
+        check,
+        digital_controller(nominal),
+        nominal.loop_delay_s * nominal.sample_rate_Hz,
+        find_culprit(unstable[0]) if unstable else None,
+        rest,
+    )
 
 
 def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None) -> SampledLoop:
@@ -82,15 +80,6 @@ def bare_loop(design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None
     )
 
 
-def nominal_loop(
-    design: Design, rig: Rig, plant: DesignPlant, K: StateSpace | None, companions: Companions | None = None
-) -> SampledLoop:
-    """The design's controller and the loops of the other axes (designed here by default) on the nominal rig."""
-    bare = bare_loop(design, rig, plant, K)
-    companions = companions or design_companions(bare, plant.weights.get("actuator chain *"), design.floor.band_Hz)
-    return replace(bare, loops=companions.systems())
-
-
 @dataclass(frozen=True)
 class SixDofSettings:
     """slowest_Hz : lowest frequency of the check [Hz]: below it geophones measure little but their own noise.
@@ -111,7 +100,8 @@ def six_dof_check(
     The frequencies are those of the design model, lower ones, the ends of the band, and points around the peaks, over
     all frequencies and in the band: a lightly damped mode is narrower than the grid.
     """
-    T2, loop = result.transmissibility, nominal_loop(design, rig, plant, result.K, companions)
+    T2 = result.transmissibility
+    loop = replace(bare_loop(design, rig, plant, result.K), loops=companions.systems())
     kept = [COORDINATES.index(name) for name in design.keep]
     others = [k for k in range(6) if k not in kept]
     known: dict[float, np.ndarray] = {}

@@ -87,9 +87,7 @@ def tuned_skyhook(
     it has the smallest worst-case peak, and a note states this. By the bounds over the whole set it is never worse than
     critical damping with the usual corners.
 
-    Raises
-    ------
-    ComputationError : no tuning tried, including the classical ones, is stable on the nominal plant.
+    Raises ComputationError: no tuning tried, including the classical ones, is stable on the nominal plant.
     """
     evaluation = WorstCaseTuning(plant, design, peak_limit, settings)
     classical = classical_loops(plant, rig, design)

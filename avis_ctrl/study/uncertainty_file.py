@@ -170,9 +170,7 @@ def rig_sha256(rig: Rig) -> str:
 def read_uncertainty(path: str | Path) -> UncertaintyFile:
     """Read and check an uncertainty file.
 
-    Raises
-    ------
-    InputError : one line naming file, field, value and what was expected.
+    Raises InputError: one line naming file, field, value and what was expected.
     """
     path = Path(path)
     content = read_json(path, "avis-uncertainty", "the uncertainty.json of an identification")

@@ -13,6 +13,8 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 
 @dataclass(frozen=True)
 class WorkerSettings:
@@ -35,13 +37,15 @@ def available() -> int:
 
 
 def as_worker(parent: int, on_interrupt: signal.Handlers = signal.SIG_DFL, niceness: int = 0) -> None:
-    """Make this process a worker: Ctrl-C, SIGTERM and the death of the parent end it at once and silently.
+    """Make this process a worker: Ctrl-C, SIGTERM and the death of the parent end it at once and silently. It uses one
+    BLAS thread.
 
     on_interrupt : SIG_IGN if the parent decides on Ctrl-C, which reaches all processes: it may continue with its
         results.
     """
     if niceness and hasattr(os, "nice"):
         os.nice(niceness)
+    threadpool_limits(1)
     signal.signal(signal.SIGINT, on_interrupt)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 

@@ -16,14 +16,13 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.design_file import Design, design_from_table, study_of
-from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.output import controller_dict
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import run_design
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, put, with_rig_keys
-from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.points import PointsFile
 from avis_ctrl.sweep.task import Job
 
 KEYS = {**keys_of(Design), "base": False}
@@ -39,17 +38,15 @@ class DesignBase:
     table: dict[str, Any]
     rig: Rig
     others: dict[str, DesignBase] = field(default_factory=dict)
-    quantities: Mapping[str, str] = field(
-        default_factory=lambda: {
-            "mu_upper": "mu, upper bound [1]",
-            "mu_lower": "mu, lower bound [1]",
-            "guaranteed": "bounds proved",
-            "worst_case_peak_transmissibility_dB": "worst-case transmissibility, peak [dB]",
-            BAND: "worst-case transmissibility in the band [dB]",
-            "order": "states of the controller [1]",
-        }
-    )
-    pareto: tuple[str, str] | None = ("mu_upper", BAND)
+    quantities = {
+        "mu_upper": "mu, upper bound [1]",
+        "mu_lower": "mu, lower bound [1]",
+        "guaranteed": "bounds proved",
+        "worst_case_peak_transmissibility_dB": "worst-case transmissibility, peak [dB]",
+        BAND: "worst-case transmissibility in the band [dB]",
+        "order": "states of the controller [1]",
+    }
+    pareto = ("mu_upper", BAND)
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> DesignBase:
@@ -94,28 +91,16 @@ class DesignBase:
 
 def compute(design: Design, rig: Rig, skyhook: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """Figures of the controller, and the controller itself."""
-    found, further = _skyhook(design, rig) if skyhook else _mu(design, rig)
-    return figures_of(found) | further, {"controller": controller_dict(found)}
-
-
-def _mu(design: Design, rig: Rig) -> tuple[ControllerResult, dict[str, Any]]:
-    result = run_design(design, rig)
-    return result.controller("mu"), {
-        "stable": result.stable,
-        "requirements_met": all(one.met for one in result.requirements),
-    }
-
-
-def _skyhook(design: Design, rig: Rig) -> tuple[ControllerResult, dict[str, Any]]:
-    plant = build_plant(design, rig)
-    made = classical_skyhook(plant, rig, design)
-    samples = random_perturbations(plant, 0, design.simulation.seed)
-    return analyse(design, plant, made.K, made.name, made.title, made.kind, samples, made.notes), {}
-
-
-def figures_of(found: ControllerResult) -> dict[str, Any]:
-    """The figures of a controller for the table."""
-    return {
+    further = {}
+    if skyhook:
+        plant = build_plant(design, rig)
+        samples = random_perturbations(plant, 0, design.simulation.seed)
+        found = analyse(design, plant, classical_skyhook(plant, rig, design), samples)
+    else:
+        result = run_design(design, rig)
+        found = result.controller("mu")
+        further = {"stable": result.stable, "requirements_met": all(one.met for one in result.requirements)}
+    figures = {
         "mu_upper": found.mu.upper,
         "mu_lower": found.mu.lower,
         "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
@@ -123,3 +108,4 @@ def figures_of(found: ControllerResult) -> dict[str, Any]:
         BAND: decibels(found.worst_band.upper),
         "order": found.order,
     }
+    return figures | further, {"controller": controller_dict(found.name, found.K)}

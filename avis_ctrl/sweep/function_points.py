@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.study.files import as_json
-from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.points import PointsFile
 from avis_ctrl.sweep.task import Job
 
 
@@ -22,8 +22,8 @@ class FunctionBase:
     source: str
     path: Path
     name: str
-    quantities: Mapping[str, str] = field(default_factory=dict)
-    pareto: tuple[str, str] | None = None
+    quantities: ClassVar[Mapping[str, str]] = {}
+    pareto = None
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> FunctionBase:

@@ -8,27 +8,25 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign, digest
 from avis_ctrl.measurement.formats import read_measurements
-from avis_ctrl.rigs.file_errors import validated
+from avis_ctrl.rigs.file_errors import Section, validated
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.study.gap import GapOptions, find_gap
 from avis_ctrl.sweep.keys import FACTOR, VALUE, expanded, keys_of, with_rig_keys
-from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.points import PointsFile
 from avis_ctrl.sweep.task import Job
 
 Hertz = Annotated[float, Field(gt=0)]
 
 
-class Options(BaseModel):
+class Options(Section):
     """The options of `avis gap` that may vary, validated."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
     seed: Annotated[int, Field(ge=0)] = 1
     band_Hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] | None = None
@@ -49,18 +47,16 @@ class GapBase:
     rig_name: str
     rig: Rig
     digests: dict[Path, str] = field(default_factory=dict)
-    quantities: Mapping[str, str] = field(
-        default_factory=lambda: {
-            "verdict": "verdict",
-            "effects": "named effects",
-            "nrmse_nominal": "gap before [1]",
-            "nrmse_identified": "gap after identification [1]",
-            "nrmse": "gap with the named effects [1]",
-            "noise_nrmse": "noise [1]",
-            "search_seconds": "time of the search [s]",
-        }
-    )
-    pareto: tuple[str, str] | None = ("search_seconds", "nrmse")
+    quantities = {
+        "verdict": "verdict",
+        "effects": "named effects",
+        "nrmse_nominal": "gap before [1]",
+        "nrmse_identified": "gap after identification [1]",
+        "nrmse": "gap with the named effects [1]",
+        "noise_nrmse": "noise [1]",
+        "search_seconds": "time of the search [s]",
+    }
+    pareto = ("search_seconds", "nrmse")
 
     @classmethod
     def read(cls, file: PointsFile, folder: Path) -> GapBase:

@@ -41,17 +41,11 @@ def keys_of(model: type[BaseModel], before: str = "") -> dict[str, bool]:
     return found
 
 
-def parts_of(key: str, known: Mapping[str, bool]) -> list[str]:
-    """Split a dotted key; an arbitrary key inside a table ("isolator*.k_z") keeps its dots."""
-    for table in (name for name, free in known.items() if free and key.startswith(f"{name}.")):
-        return [*table.split("."), key[len(table) + 1 :]]
-    return key.split(".")
-
-
 def put(table: dict[str, Any], key: str, value: Any, known: Mapping[str, bool]) -> None:
-    """Set a dotted key in nested tables."""
-    *parents, last = parts_of(key, known)
-    for name in parents:
+    """Set a dotted key in nested tables; an arbitrary key inside a table ("isolator*.k_z") keeps its dots."""
+    free = next((name for name, free in known.items() if free and key.startswith(f"{name}.")), None)
+    before, _, last = key.rpartition(".") if free is None else (free, "", key[len(free) + 1 :])
+    for name in before.split(".") if before else ():
         table = table.setdefault(name, {})
     table[last] = value
 

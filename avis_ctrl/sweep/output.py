@@ -14,7 +14,8 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.files import write_together
-from avis_ctrl.plot.pareto import pareto_front, pareto_png
+from avis_ctrl.plot.axes import png
+from avis_ctrl.plot.pareto import pareto, pareto_front
 from avis_ctrl.study.files import as_json, values_of
 from avis_ctrl.summary import html_table
 from avis_ctrl.sweep.run import Row, Sweep
@@ -49,7 +50,8 @@ def write_sweep(sweep: Sweep, folder: Path) -> list[Path]:
             for k, row in enumerate(sweep.rows)
         ]
         labels = [sweep.quantities.get(name, name) for name in sweep.pareto]
-        contents["pareto.png"] = pareto_png(_values(sweep), labels, names, sweep.file.title)
+        values, title = _values(sweep), sweep.file.title
+        contents["pareto.png"] = png(lambda ax: pareto(values, labels, names, ax, title), 7.2, 4.8)
     contents["sweep.html"] = _page(sweep, front, contents.get("pareto.png")).encode()
     contents["sweep.json"] = as_json(_dict(sweep, front))
     return write_together(folder, contents, [folder / name for name in FILES])

@@ -7,20 +7,52 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.study.provenance import provenance
-from avis_ctrl.sweep.kinds import Base, open_base
 from avis_ctrl.sweep.local import on_this_machine
-from avis_ctrl.sweep.points import Point, SweepSettings, points_of
-from avis_ctrl.sweep.points_file import PointsFile, read_points_file
-from avis_ctrl.sweep.task import LASTING, Task, identity_of, read_point, save_point
+from avis_ctrl.sweep.points import Point, PointsFile, points_of, read_points_file
+from avis_ctrl.sweep.task import LASTING, Job, Task, identity_of, read_point, save_point
 
 Backend = Callable[[Sequence[Task]], Iterator[dict[str, Any]]]
 # Arguments: number of finished points, number of all points, message about the last one.
 Progress = Callable[[int, int, str], None]
 POINTS = "points"
+
+
+class Base(Protocol):
+    """The common part of the points of a sweep."""
+
+    @property
+    def quantities(self) -> Mapping[str, str]:
+        """Labels, with units, of the figures."""
+
+    @property
+    def pareto(self) -> tuple[str, str] | None:
+        """The two quantities of the plot; None without a natural choice."""
+
+    def expand(self, key: str) -> Sequence[str]:
+        """The keys that match a key. Raises InputError for an unknown key."""
+
+    def job(self, point: Mapping[str, Any]) -> Job:
+        """The base with the values of a point. Raises InputError for values that do not fit."""
+
+
+def open_base(file: PointsFile, folder: Path) -> Base:
+    """The base of a points file in a folder. Raises InputError if it is missing or invalid."""
+    # Late imports: a process that computes one kind does not load the others.
+    if file.kind == "gap":
+        from avis_ctrl.sweep.gap_points import GapBase
+
+        return GapBase.read(file, folder)
+    if file.kind == "function":
+        from avis_ctrl.sweep.function_points import FunctionBase
+
+        return FunctionBase.read(file, folder)
+    from avis_ctrl.sweep.design_points import DesignBase
+
+    return DesignBase.read(file, folder)
 
 
 @dataclass(frozen=True)
@@ -68,12 +100,10 @@ class Plan:
         return [one for one in self.tasks if isinstance(one, InputError)]
 
 
-def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) -> Plan:
+def plan_sweep(path: Path, folder: Path) -> Plan:
     """Check a points file before anything is computed or written.
 
-    Raises
-    ------
-    InputError : an invalid file, base or key; values from which not a single point can be made.
+    Raises InputError: an invalid file, base or key; values from which not a single point can be made.
     """
     file = read_points_file(path)
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -84,7 +114,7 @@ def plan_sweep(path: Path, folder: Path, settings: SweepSettings | None = None) 
             raise error.in_file(path) from None
         raise InputError(str(error), file=path, field="base", value=file.base) from None
     try:
-        points = points_of(file, base.expand, settings or SweepSettings())
+        points = points_of(file, base.expand)
     except InputError as error:
         raise error.in_file(path) from None
     known = [*base.quantities, *dict.fromkeys(key for point in points for key in point)]
@@ -114,9 +144,7 @@ def run_sweep(
     The folder of the points must exist. If the process is killed at any time, the same call continues with the
     unfinished points.
 
-    Raises
-    ------
-    ComputationError : a point's file could not be written, a cluster was lost.
+    Raises ComputationError: a point's file could not be written, a cluster was lost.
     """
     began = time.monotonic()
     known: dict[str, dict[str, Any]] = {}

@@ -32,7 +32,7 @@ def write_folder(path: Path, design_name: str, make) -> Path:
     companions = design_companions(loop, plant.weights.get("actuator chain *"), design.floor.band_Hz)
     (path / "controllers").mkdir(parents=True)
     (path / "study.json").write_bytes(as_json(study_dict(design, rig)))
-    (path / "controllers" / f"{made.name}.json").write_bytes(as_json(controller_dict(made)))
+    (path / "controllers" / f"{made.name}.json").write_bytes(as_json(controller_dict(made.name, made.K)))
     rows = [
         {
             "axis": one.axis,

@@ -34,6 +34,7 @@ from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.sampled_loop import NO_ANTI_WINDUP, AntiWindup, lever_arms
 from avis_ctrl.study.controllers import mu_optimal
+from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 
@@ -158,7 +159,9 @@ def test_figures_are_near_those_of_the_design(shipped, package):
     from avis_ctrl.study.analysis import analyse
 
     K = shipped.controller("mu")
-    designed = analyse(shipped.design, shipped.plant, K, "mu", "mu", "mu", random_perturbations(shipped.plant, 1, 1))
+    designed = analyse(
+        shipped.design, shipped.plant, Candidate("mu", "mu", "mu", K), random_perturbations(shipped.plant, 1, 1)
+    )
     found = package.certificate.content
     assert designed.mu.lower <= found["mu_upper"] <= 1.01 * designed.mu.upper
     assert found["mu_lower"] <= found["mu_upper"] <= 1.03 * found["mu_lower"]

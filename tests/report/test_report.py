@@ -248,7 +248,7 @@ def test_comparison_says_who_is_unstable(fabricated: DesignResult) -> None:
 @pytest.mark.slow
 def test_a_study_that_found_little_is_still_reported(fabricated: DesignResult) -> None:
     none = np.zeros(0)
-    empty = Bound(np.inf, np.nan, np.nan, False, None, (), none, none, none)
+    empty = Bound(np.inf, np.nan, np.nan, None, False, "", none, none, none)
     poor = replace(
         fabricated,
         requirements=(),

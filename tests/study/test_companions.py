@@ -18,6 +18,7 @@ from avis_ctrl.simulation.sampled_response import sampled_response
 from avis_ctrl.study.analysis import analyse
 from avis_ctrl.study.companions import CompanionSettings, design_companions, until_stable
 from avis_ctrl.study.design_file import design_from_table
+from avis_ctrl.study.design_result import Candidate
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
 from avis_ctrl.study.skyhooks import SETTINGS, classical_skyhook, critical_gains
@@ -129,4 +130,4 @@ def test_an_unstable_rival_says_so_instead_of_ending_the_command(table):
     design, rig, plant = table
     K = classical_skyhook(plant, rig, design).K.scaled(left=40.0)
     with pytest.raises(ComputationError, match=r"unstable with the nominal plant.*closed-loop pole at .* Hz"):
-        analyse(design, plant, K, "skyhook", "skyhook", "skyhook", np.zeros((0, 0, 0)))
+        analyse(design, plant, Candidate("skyhook", "skyhook", "skyhook", K), np.zeros((0, 0, 0)))

@@ -98,8 +98,8 @@ def test_files_and_predictions(rehearsal, found, tmp_path):
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["format"] == "avis-identification" and result["rank"] == 20
     assert result["parameters"]["mass"]["std"] > 0 and result["parameters"]["isolator1.k_x"]["std"] is None
-    rig, corner, turning = read_identified(tmp_path)
-    assert corner is None and turning == (0, 0)
+    rig, known = read_identified(tmp_path)
+    assert known.amplifier_corner_Hz is None and known.turning == (0, 0)
     assert rig.parameters()["mass"].value == pytest.approx(found.rig.parameters()["mass"].value, rel=1e-14)
     assert "+-" in (tmp_path / "rig.toml").read_text()
     one = rehearsal.campaign.only(("02",))

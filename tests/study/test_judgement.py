@@ -59,7 +59,7 @@ def measured(one_axis) -> dict[str, ControllerResult]:
     design, plant = one_axis
     samples = random_perturbations(plant, 3, 1)
     return {
-        c.name: analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
+        c.name: analyse(design, plant, c, samples)
         for c in (passive(), classical_skyhook(plant, load_rig("avis"), design))
     }
 

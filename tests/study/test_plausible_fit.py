@@ -6,7 +6,7 @@ import pytest
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.study.plausible_fit import far_from_file
+from avis_ctrl.study.identification import far_from_file
 
 NAMES = ("mass", "J1", "J2", "J3", "isolator1.k_z", "isolator2.k_z", "isolator3.k_z", "isolator1.c_z")
 

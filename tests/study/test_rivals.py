@@ -173,7 +173,7 @@ def result(name: str, title: str, mu: float, K, stable: bool = True, notes: tupl
         "K": K,
         "stable": stable,
         "notes": notes,
-        "mu": Bound(mu, 0.9 * mu, 1.0, True, None, (), np.zeros(0), np.zeros(0), np.zeros(0)),
+        "mu": Bound(mu, 0.9 * mu, 1.0, None, True, "", np.zeros(0), np.zeros(0), np.zeros(0)),
     }
     return ControllerResult(**{field.name: given.get(field.name) for field in fields(ControllerResult)})
 

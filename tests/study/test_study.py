@@ -27,7 +27,7 @@ from avis_ctrl.study.output import write_study
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import design_provenance, run_design
-from avis_ctrl.study.simulation import nominal_loop, with_delta
+from avis_ctrl.study.simulation import bare_loop, with_delta
 from avis_ctrl.study.skyhooks import classical_skyhook
 from avis_ctrl.uncertainty.blocks import BlockStructure, ComplexScalar, RealScalar
 
@@ -231,10 +231,7 @@ def test_files_of_a_small_study_follow_the_contract(small, tmp_path):
     design, plant = small
     rig = load_rig("avis")
     samples = random_perturbations(plant, 5, 1)
-    controllers = [
-        analyse(design, plant, c.K, c.name, c.title, c.kind, samples)
-        for c in (passive(), classical_skyhook(plant, rig, design))
-    ]
+    controllers = [analyse(design, plant, c, samples) for c in (passive(), classical_skyhook(plant, rig, design))]
     result = partial_result(
         design=design,
         rig=rig,
@@ -355,7 +352,7 @@ def test_simulated_plants_have_their_sensor_chains():
     )
     rig = load_rig("avis")
     plant = build_plant(design, rig)
-    nominal = nominal_loop(design, rig, plant, None)
+    nominal = bare_loop(design, rig, plant, None)
     blocks = plant.synthesis.blocks
     changed = with_delta(rig, plant, nominal, "random", blocks.assemble([0.5j] * len(blocks.blocks)), 60.0)
     chained = {block.name.removeprefix("sensor chain ") for block in blocks.blocks}

@@ -23,7 +23,7 @@ from avis_ctrl.study.identified_uncertainty import RESPONSE, in_design
 from avis_ctrl.study.plant import build_plant, channels_gain
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import design_provenance
-from avis_ctrl.study.simulation import nominal_loop, with_delta
+from avis_ctrl.study.simulation import bare_loop, with_delta
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty, uncertainty_content, uncertainty_json
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection
 
@@ -295,7 +295,7 @@ def test_a_member_of_the_set_is_simulated_as_it_is(folder):
     delta, omega = random_perturbations(plant, 3, 1)[2], 2 * np.pi * 7.0
     words = describe(plant, plant.synthesis.blocks, delta)
     assert any(one.startswith("identified direction 1 at ") and "%" in one for one in words)
-    loop = with_delta(rig, plant, nominal_loop(design, rig, plant, None), "member", delta, omega)
+    loop = with_delta(rig, plant, bare_loop(design, rig, plant, None), "member", delta, omega)
     values = loop.plant.parameters()
     direction = plant.rig.parameters[1]
     assert isinstance(direction, UncertainDirection)

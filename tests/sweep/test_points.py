@@ -12,8 +12,7 @@ import pytest
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.sweep.design_points import KEYS, DesignBase
-from avis_ctrl.sweep.points import SweepSettings, points_of
-from avis_ctrl.sweep.points_file import PointsFile
+from avis_ctrl.sweep.points import PointsFile, SweepSettings, points_of
 from avis_ctrl.sweep.run import plan_sweep, run_sweep
 from avis_ctrl.sweep.task import lost
 

@@ -12,12 +12,12 @@ def toml_text(table: dict[str, Any]) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value on one line; a table as an inline table."""
+    """A value on one line; a table as an inline table, an array as a list."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{_key(key)} = {toml_value(one)}" for key, one in value.items()) + " }"
     # JSON and TOML write numbers, booleans, strings and lists alike, except for one character that TOML requires
     # escaped.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value, ensure_ascii=False, default=lambda array: array.tolist()).replace("\x7f", "\\u007f")
 
 
 def _sections(title: str, table: dict[str, Any]) -> list[list[str]]:
