@@ -104,16 +104,11 @@ def export(
 
 def _picture(orders: Sequence[tuple[int, float]]) -> bytes:
     """Plot of mu against controller order (PNG)."""
-    import io
-
-    from matplotlib.figure import Figure
-
     from avis_ctrl.plot import order
+    from avis_ctrl.plot.axes import png
 
-    file, figure = io.BytesIO(), Figure(figsize=(6, 4), layout="constrained")
-    order(list(orders), figure.add_subplot()).set_title("mu at most, with the design's model; the last one is exported")
-    figure.savefig(file, format="png", dpi=150)
-    return file.getvalue()
+    title = "mu at most, with the design's model; the last one is exported"
+    return png(lambda ax: order(list(orders), ax).set_title(title), (6, 4))
 
 
 def _orders(terminal: Terminal, orders: Sequence[tuple[int, float]]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -41,6 +43,11 @@ def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> An
     return ax
 
 
+def limit_line(ax: Any, value: float, label: str, **line: Any) -> None:
+    """A thin horizontal line, red unless stated otherwise."""
+    ax.axhline(value, label=label, **{"color": "#b3261e", "linewidth": 0.9, **line})
+
+
 def log_if_wide(ax: Any, values: np.ndarray) -> None:
     """Make the y axis logarithmic, with labels at 1, 2 and 5 of each decade, if the values span more than a decade."""
     if values.max() <= 10 * values.min():
@@ -51,6 +58,16 @@ def log_if_wide(ax: Any, values: np.ndarray) -> None:
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
     ax.yaxis.set_minor_formatter(NullFormatter())
+
+
+def png(draw: Callable[[Any], Any], size_in: tuple[float, float]) -> bytes:
+    """A plot as the bytes of a PNG file. draw : into the axes that it is given."""
+    from matplotlib.figure import Figure
+
+    file, figure = io.BytesIO(), Figure(figsize=size_in, layout="constrained")
+    draw(figure.subplots())
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
 
 
 def whole_numbers(ax: Any) -> None:
