@@ -69,10 +69,11 @@ def hostile(name, request, fabricated) -> Document:
 
 
 def test_same_sections_figures_and_tables_in_both(name, report, tmp_path) -> None:
-    content, page, text = report.document, Reader(report.html), pdf_text(report.pdf, tmp_path)
+    content, page = report.document, Reader(report.html)
     assert len(content.sections) == SECTIONS[name]
     drawn = [a["data-name"] for tag, a in page.elements if "data-name" in a]
     assert drawn == [p.name for p in content.figures() if isinstance(p, Figure)] == list(page.graphs())
+    text = pdf_text(report.pdf, tmp_path)
     count = sum(len(tables(s)) for s in content.sections)
     for word, things in (("Figure", len(content.figures())), ("Table", count)):
         for source in (page.text, text):
