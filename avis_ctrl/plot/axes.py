@@ -53,6 +53,11 @@ def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> An
     return ax
 
 
+def limit_line(ax: Any, value: float, label: str, **line: Any) -> None:
+    """A thin horizontal line, red unless stated otherwise."""
+    ax.axhline(value, label=label, **{"color": "#b3261e", "linewidth": 0.9, **line})
+
+
 def log_if_wide(ax: Any, values: np.ndarray) -> None:
     """Make the y axis logarithmic, with labels at 1, 2 and 5 of each decade, if the values span more than a decade."""
     if values.max() <= 10 * values.min():

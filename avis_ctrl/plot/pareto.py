@@ -37,31 +37,17 @@ def pareto(
     ax = axes_of(ax)
     values = np.asarray(values, dtype=float)
     front = pareto_front(values)
-    ax.plot(
-        *values.T, "o", markersize=4, color=POINT, label=f"{int(np.sum(np.all(np.isfinite(values), axis=1)))} points"
-    )
-    ax.step(
-        *values[front].T,
-        "o-",
-        where="post",
-        markersize=5,
-        linewidth=1.2,
-        color=FRONT,
-        label=f"Pareto front, {front.size}",
-    )
+    known = int(np.sum(np.all(np.isfinite(values), axis=1)))
+    ax.plot(*values.T, "o", markersize=4, color=POINT, label=f"{known} points")
+    look = {"where": "post", "markersize": 5, "linewidth": 1.2, "color": FRONT}
+    ax.step(*values[front].T, "o-", label=f"Pareto front, {front.size}", **look)
     ax.margins(0.08)
     middle = (np.nanmin(values[:, 0]) + np.nanmax(values[:, 0])) / 2 if front.size else np.nan
     for k in front if len(names) else ():
         # There are no points below and to the left of the front; near the left edge there is no room for a label.
         late = values[k, 0] > middle
-        ax.annotate(
-            names[k],
-            values[k],
-            textcoords="offset points",
-            fontsize="x-small",
-            color=FRONT,
-            **({"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}),
-        )
+        place = {"xytext": (-6, -4), "ha": "right", "va": "top"} if late else {"xytext": (6, 5)}
+        ax.annotate(names[k], values[k], textcoords="offset points", fontsize="x-small", color=FRONT, **place)
     if title:
         ax.set_title(title, fontsize="medium")
     return finish(ax, labels[0], labels[1], log=False)

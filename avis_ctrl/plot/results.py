@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.norms import in_dB
-from avis_ctrl.plot.axes import HERTZ, axes_of, finish, log_if_wide, whole_numbers
+from avis_ctrl.plot.axes import HERTZ, axes_of, finish, limit_line, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 
 # Palette of Okabe and Ito; controllers have the same colours as in the report.
@@ -21,7 +21,7 @@ COLOURS = {
     "hinf": "#009e73",
     "mu": "#0072b2",
 }
-LIMIT, LOWER = "#b3261e", "#e69f00"
+LOWER = "#e69f00"
 
 
 def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu"]) -> Any:
@@ -53,9 +53,7 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
     if np.isfinite(peak.upper):
         worth = "proved between all points" if peak.guaranteed else "at the computed points only"
-        ax.axhline(
-            peak.upper, color=color, linewidth=0.8, linestyle="--", label=f"peak below {peak.upper:.4g}, {worth}"
-        )
+        limit_line(ax, peak.upper, f"peak below {peak.upper:.4g}, {worth}", color=color, linestyle="--")
     if np.isfinite(peak.lower) and peak.lower > 0 and np.isfinite(peak.omega):
         at = peak.omega / HERTZ
         # Zero has no place on the axis. With real parameters alone, mu can be zero at all other frequencies.
@@ -94,23 +92,14 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
         raise InputError(f"expected some of {', '.join(known)}", field="controllers", value=unknown[0])
     for name in names:
         one, t = known[name], known[name].transmissibility
-        colour = COLOURS.get(name, "#222222")
-        ax.plot(t.omega / HERTZ, in_dB(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
+        f, colour = t.omega / HERTZ, COLOURS.get(name, "#222222")
+        ax.plot(f, in_dB(t.sigma), color=colour, label=one.title, linewidth=2 if name == "mu" else 1.3)
         if name == names[-1]:
-            ax.fill_between(
-                t.omega / HERTZ,
-                in_dB(t.low),
-                in_dB(t.high),
-                color=colour,
-                alpha=0.25,
-                linewidth=0,
-                label=f"{one.title}, sampled plants",
-            )
+            look = {"color": colour, "alpha": 0.25, "linewidth": 0}
+            ax.fill_between(f, in_dB(t.low), in_dB(t.high), label=f"{one.title}, sampled plants", **look)
             if np.isfinite(one.worst_peak.upper):
                 level = float(in_dB(np.array(one.worst_peak.upper)))
-                ax.axhline(
-                    level, color=LIMIT, linewidth=0.9, linestyle="--", label=f"{one.title}, worst case {level:.1f} dB"
-                )
+                limit_line(ax, level, f"{one.title}, worst case {level:.1f} dB", linestyle="--")
     return finish(ax, "frequency [Hz]", "transmissibility [dB]")
 
 
@@ -130,11 +119,7 @@ def dk_history(history: Any, ax: Any = None) -> Any:
     steps = [row.iteration for row in rows]
     ax.plot(steps, [row.gamma for row in rows], "s--", color="#e69f00", markersize=4, label="gamma of the scaled loop")
     ax.plot(steps, [row.mu_upper for row in rows], "o-", color=COLOURS["mu"], markersize=4, label="peak mu on the grid")
-    values = np.array([[row.gamma, row.mu_upper] for row in rows])
-    log_if_wide(ax, values)
-    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":", label="mu = 1")
-    whole_numbers(ax)
-    return finish(ax, "iteration", "gamma, mu", log=False)
+    return _progress(ax, np.array([[row.gamma, row.mu_upper] for row in rows]), "iteration", "gamma, mu")
 
 
 def order(history: Any, ax: Any = None) -> Any:
@@ -153,18 +138,9 @@ def order(history: Any, ax: Any = None) -> Any:
     )
     states, values = (np.array(part, float) for part in zip(*sorted(rows), strict=True))
     ax.plot(states, values, "o", color=COLOURS["mu"], markersize=4, label="controllers")
-    ax.step(
-        states,
-        np.minimum.accumulate(values),
-        where="post",
-        color=COLOURS["mu"],
-        linewidth=1,
-        label="least mu up to this order",
-    )
-    log_if_wide(ax, values)
-    ax.axhline(1.0, color=LIMIT, linewidth=0.9, linestyle=":", label="mu = 1")
-    whole_numbers(ax)
-    return finish(ax, "states of the controller", "peak mu", log=False)
+    look = {"where": "post", "color": COLOURS["mu"], "linewidth": 1}
+    ax.step(states, np.minimum.accumulate(values), label="least mu up to this order", **look)
+    return _progress(ax, values, "states of the controller", "peak mu")
 
 
 def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None, ax: Any = None) -> Any:
@@ -183,15 +159,8 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
     for one in CRITERIA:
         f = one.midbands()
         ax.plot(f, 1e6 * one.limit(f), color="#8a8a8a", linewidth=1)
-        ax.annotate(
-            one.name,
-            (f[-1], 1e6 * one.limit(f)[-1]),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize="x-small",
-            color="#555555",
-        )
+        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        ax.annotate(one.name, (f[-1], 1e6 * one.limit(f)[-1]), fontsize="x-small", color="#555555", **place)
     for name, (f, rms) in (spectra or {}).items():
         f, rms = np.asarray(f, float), np.asarray(rms, float)
         if f.shape != rms.shape or f.ndim != 1:
@@ -201,6 +170,14 @@ def vc_curves(spectra: Mapping[str, tuple[np.ndarray, np.ndarray]] | None = None
     ax.set_yscale("log")
     ax.margins(x=0.08)
     return finish(ax, "midband of the third octave [Hz]", "velocity, r.m.s. [µm/s]")
+
+
+def _progress(ax: Any, values: np.ndarray, x: str, y: str) -> Any:
+    """Finish a plot over whole numbers, with the limit 1 and a logarithmic y axis if the values span a decade."""
+    log_if_wide(ax, values)
+    limit_line(ax, 1.0, "mu = 1", linestyle=":")
+    whole_numbers(ax)
+    return finish(ax, x, y, log=False)
 
 
 def _rows(history: Any) -> list[Any]:

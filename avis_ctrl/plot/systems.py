@@ -146,23 +146,20 @@ def _curves(system: Any, omega: Any, frequency_Hz: Any, label: Any) -> list[_Cur
     """The responses of a system, or of those of a list, with labels."""
     every = list(system) if isinstance(system, (list, tuple)) else [system]
     alone = len(every) == 1
-    uncertain = [isinstance(one, UncertainSystem) for one in every]
-    if isinstance(label, str) or label is None:
-        default = (
-            ["nominal" if uncertain[0] and every[0].shape == (1, 1) else None]
-            if alone
-            else [f"system {k + 1}" for k in range(len(every))]
-        )
-        labels = default if label is None else [label] if alone else [f"{label} {k + 1}" for k in range(len(every))]
-    else:
+    if not isinstance(label, str) and label is not None:
         labels = list(label)
+    elif not alone:
+        labels = [f"{'system' if label is None else label} {k + 1}" for k in range(len(every))]
+    else:
+        single = isinstance(every[0], UncertainSystem) and every[0].shape == (1, 1)
+        labels = ["nominal" if single and label is None else label]
     if not every or len(labels) != len(every):
         raise InputError(f"expected at least one system and one label for each; systems: {len(every)}", field="label")
-    members = [one.nominal if is_uncertain else one for one, is_uncertain in zip(every, uncertain, strict=True)]
-    grids = _rad_s(omega, frequency_Hz, members)
+    members = [one.nominal if isinstance(one, UncertainSystem) else one for one in every]
     found = []
-    for one, member, grid, text, is_uncertain in zip(every, members, grids, labels, uncertain, strict=True):
-        samples = [response_of(each, grid) for each in one.sample(SETTINGS.samples)] if is_uncertain else []
+    for one, member, grid, text in zip(every, members, _rad_s(omega, frequency_Hz, members), labels, strict=True):
+        drawn = one.sample(SETTINGS.samples) if isinstance(one, UncertainSystem) else []
+        samples = [response_of(each, grid) for each in drawn]
         found.append(_Curves(one, grid / HERTZ, response_of(member, grid), samples, text, alone))
     return found
 

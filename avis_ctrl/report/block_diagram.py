@@ -50,7 +50,7 @@ class BlockDiagram:
         drawn: set[tuple[str, str]] = set()
         for s in self.signals:
             for reader in s.readers:
-                source = "K" if s.role == "u" else s.source
+                source = self._source(s)
                 if (source, reader) not in drawn and not self._in_chain(source, reader):
                     drawn.add((source, reader))
                     self._link(s, source, reader)
@@ -86,7 +86,7 @@ class BlockDiagram:
     def _beside(self, name: str, taken: set[tuple[float, int]]) -> None:
         """Place a part: to the right, one row below its source in the chain; or else to the left of its reader (below
         it, if Delta drives the part); or else below its source outside the chain."""
-        feeding = ["K" if s.role == "u" else s.source for s in self.signals if name in s.readers]
+        feeding = [self._source(s) for s in self.signals if name in s.readers]
         reading = [r for s in self.signals if s.source == name for r in s.readers]
         before = [self.rows[n] for n in feeding if n in self.nodes and n in self.chain]
         after = [self.rows[n] for n in reading if n in self.nodes]
@@ -117,6 +117,10 @@ class BlockDiagram:
     def _height(self, name: str) -> float:
         return RIG_HEIGHT if self.kind.get(name, ("", 1))[0] == "rig" else BOX_HEIGHT
 
+    @staticmethod
+    def _source(s: SignalFamily) -> str:
+        return "K" if s.role == "u" else s.source
+
     def _in_chain(self, source: str, reader: str) -> bool:
         return (source, reader) in zip(self.chain, self.chain[1:], strict=False)
 
@@ -124,30 +128,17 @@ class BlockDiagram:
         """The chain down the middle, and the measurement fed back to the controller at the top."""
         for upper, lower in zip(self.chain, self.chain[1:], strict=False):
             (x, y, _), (_, y2, _) = self.nodes[upper], self.nodes[lower]
-            between = [
-                s
-                for s in self.signals
-                if lower in s.readers and (s.source == upper or (upper == "K" and s.role == "u"))
-            ]
+            between = next(s for s in self.signals if lower in s.readers and self._source(s) == upper)
             tip = y2 - self._height(lower) / 2
             self.canvas.line([(x, y + self._height(upper) / 2), (x, tip)], width=1.6, arrow=True)
-            self.canvas.text((x - 8, tip - 9), self._label(between[0]), 11, anchor="end")
+            self.canvas.text((x - 8, tip - 9), self._label(between), 11, anchor="end")
         x, y, width = self.nodes[self.chain[-1]]
-        top = self.nodes["K"][1]
+        top, bottom, corner = self.nodes["K"][1], y + BOX_HEIGHT / 2, 26.0
+        low = bottom + 24
         seen = next(s for s in self.signals if s.role == "y")
-        corner = 26.0
-        self.canvas.line(
-            [
-                (x, y + BOX_HEIGHT / 2),
-                (x, y + BOX_HEIGHT / 2 + 24),
-                (corner, y + BOX_HEIGHT / 2 + 24),
-                (corner, top),
-                (x - width / 2, top),
-            ],
-            width=1.6,
-            arrow=True,
-        )
-        self.canvas.text((x - 8, y + BOX_HEIGHT / 2 + 18), self._label(seen), 11, anchor="end")
+        back = [(x, bottom), (x, low), (corner, low), (corner, top), (x - width / 2, top)]
+        self.canvas.line(back, width=1.6, arrow=True)
+        self.canvas.text((x - 8, low - 6), self._label(seen), 11, anchor="end")
 
     def _link(self, s: SignalFamily, source: str, reader: str) -> None:
         if source == EXTERNAL or source not in self.nodes or reader not in self.nodes:
@@ -221,29 +212,21 @@ class BlockDiagram:
     def _boxes(self) -> None:
         for name, (x, y, width) in self.nodes.items():
             kind, count = self.kind.get(name, ("controller", 1))
-            self._box(
-                kind,
-                "controller K" if name == "K" else name.removesuffix(" *"),
-                count,
-                (x, y),
-                width,
-                self._height(name),
-            )
+            shown = "controller K" if name == "K" else name.removesuffix(" *")
+            self._box(kind, shown, count, (x, y), width, self._height(name))
 
     def _box(self, kind: str, name: str, count: int, place: Point, width: float, height: float = BOX_HEIGHT) -> None:
+        (x, y), fill = place, FILLS.get(kind, "#ffffff")
         times = f" ×{count}" if count > 1 else ""
         if count > 1:
-            self.canvas.rectangle(
-                (place[0] + 4, place[1] + 4), width, height, FILLS.get(kind, "#ffffff"), "#777777", 0.8, 4
-            )
-        self.canvas.rectangle(place, width, height, FILLS.get(kind, "#ffffff"), corner=4)
-        words, size = f"{name}{times}", 12.0
-        if 6.9 * len(words) > width - 8 and " " in name:
+            self.canvas.rectangle((x + 4, y + 4), width, height, fill, "#777777", 0.8, 4)
+        self.canvas.rectangle(place, width, height, fill, corner=4)
+        if 6.9 * len(name + times) > width - 8 and " " in name:
             cut = name.index(" ", len(name) // 2 - 1) if " " in name[len(name) // 2 - 1 :] else name.rindex(" ")
-            self.canvas.text((place[0], place[1] - 3), name[:cut], size)
-            self.canvas.text((place[0], place[1] + 13), f"{name[cut + 1 :]}{times}", size)
+            self.canvas.text((x, y - 3), name[:cut])
+            self.canvas.text((x, y + 13), f"{name[cut + 1 :]}{times}")
         else:
-            self.canvas.text((place[0], place[1] + 4), words, size)
+            self.canvas.text((x, y + 4), name + times)
 
     @staticmethod
     def _label(s: SignalFamily) -> str:

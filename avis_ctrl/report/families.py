@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from avis_ctrl.study.plant import DesignPlant
-from avis_ctrl.uncertainty.generalized_plant import Part, Signal
+from avis_ctrl.uncertainty.generalized_plant import Signal
 
 EXTERNAL = "external input"
 
@@ -43,7 +44,8 @@ class Families:
             for side in "wz"
             for tag in (name[2:] for name in plant.rig.system.inputs if name.startswith("w:"))
         }
-        self.parts = self._part_families(plant.full.parts)
+        kinds = Counter((self.of(part.name), part.kind) for part in plant.full.parts)
+        self.parts = tuple(PartFamily(name, kind, count) for (name, kind), count in kinds.items())
         self.signals = self._signal_families(plant.full.signals)
 
     def of(self, name: str) -> str:
@@ -59,13 +61,6 @@ class Families:
             if name == star:
                 return "channel *"
         return name
-
-    def _part_families(self, parts: Sequence[Part]) -> tuple[PartFamily, ...]:
-        counted: dict[str, PartFamily] = {}
-        for part in parts:
-            name = self.of(part.name)
-            counted[name] = PartFamily(name, part.kind, counted[name].count + 1 if name in counted else 1)
-        return tuple(counted.values())
 
     def _signal_families(self, signals: Sequence[Signal]) -> tuple[SignalFamily, ...]:
         found: dict[tuple[str, str], SignalFamily] = {}

@@ -152,15 +152,15 @@ class Panel:
 
     x: Axis
     y: Axis
-    curves: tuple[Curve, ...]
-    bands: tuple[Band, ...] = ()
+    curves: Sequence[Curve]
+    bands: Sequence[Band] = ()
     title: str = ""
     heat: Heat | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """Panels in one or several columns, filled row by row, with one legend and a caption.
+    """Panels in at most `columns` columns, filled row by row, with one legend and a caption.
 
     height : of a panel, relative to the default. shared : the panels of a row or column have the same scales and are
     placed close together.
@@ -168,29 +168,31 @@ class Figure:
 
     name: str
     caption: str
-    panels: tuple[Panel, ...]
+    panels: Sequence[Panel]
     columns: int = 1
     height: float = 1.0
     shared: bool = False
 
-    def legend(self) -> list[Curve | Band]:
-        """Entries of the legend: each label once, in order."""
-        seen: dict[str, Curve | Band] = {}
+    def grid(self) -> tuple[int, int]:
+        """Number of rows and columns of panels."""
+        columns = min(self.columns, len(self.panels))
+        return -(-len(self.panels) // columns), columns
+
+    def legend(self) -> list[str]:
+        """Labels of the legend, each once, in order."""
+        labels: dict[str, None] = {}
         for panel in self.panels:
-            things: list[Curve | Band] = [*panel.curves, *panel.bands]
-            for thing in things:
-                if thing.label:
-                    seen.setdefault(thing.label, thing)
-        return list(seen.values())
+            labels |= dict.fromkeys([curve.label for curve in panel.curves] + [band.label for band in panel.bands])
+        return [label for label in labels if label]
 
     def heat(self) -> Heat | None:
         """The first heat map, whose colour bar applies to all panels."""
         return next((panel.heat for panel in self.panels if panel.heat is not None), None)
 
 
-def hertz(low: float = 0.1, high: float = 100.0) -> Axis:
-    """Logarithmic frequency axis over a range [Hz]."""
-    return Axis("frequency [Hz]", "log", (low, high))
+def hertz(range_Hz: tuple[float, float] | None = None) -> Axis:
+    """Logarithmic frequency axis over a range [Hz], by default that of the data."""
+    return Axis("frequency [Hz]", "log", range_Hz)
 
 
 def places(names: Sequence[str], label: str = "") -> tuple[np.ndarray, Axis]:
@@ -230,13 +232,26 @@ def log_limits(
     return (below * float(np.quantile(kept, quantile)), above * float(kept.max())) if kept.size else default
 
 
-def log_range(panel: Panel) -> tuple[float, float]:
-    """Range of the y axis of a logarithmic panel, from the data if none is given."""
-    if panel.y.range is not None:
-        return panel.y.range
-    values = [
-        np.asarray(v, float)
-        for v in (*(c.y for c in panel.curves), *(b.low for b in panel.bands), *(b.high for b in panel.bands))
-    ]
-    values += [c.y + sign * c.error for c in panel.curves if c.error is not None and c.along == "y" for sign in (1, -1)]
-    return log_limits(np.concatenate(values or [np.array([])]), 1 / 1.3, 1.3)
+def limits(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float] | None:
+    """Range of an axis of a panel; of a logarithmic one without a range, that of the data: y with a margin, x without.
+
+    None : the renderer chooses the range.
+    """
+    axis: Axis = getattr(panel, which)
+    if axis.range is not None or axis.scale == "linear":
+        return axis.range
+    if which == "x":
+        return log_limits(values_of(panel, "x"), 1.0, 1.0)
+    return log_limits(values_of(panel, "y"), 1 / 1.3, 1.3)
+
+
+def values_of(panel: Panel, which: Literal["x", "y"]) -> np.ndarray:
+    """All values of the curves, error bars and bands of a panel along an axis."""
+    values = [getattr(curve, which) for curve in panel.curves]
+    for c in panel.curves:
+        if c.error is not None and c.along == which:
+            values += [getattr(c, which) - c.error, getattr(c, which) + c.error]
+    for band in panel.bands:
+        values += [band.x] if which == "x" else [band.low, band.high]
+    values += [panel.heat.x_edges] if panel.heat is not None and which == "x" else []
+    return np.concatenate([np.asarray(v, float) for v in values] or [np.zeros(0)])

@@ -11,10 +11,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure as Canvas
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
-from avis_ctrl.report.figures import NO_DATA, Axis, Band, Curve, Figure, Heat, Panel, Style, log_range, ticks_log
+from avis_ctrl.report.figures import NO_DATA, Axis, Figure, Heat, Panel, limits, ticks_log
 
 WIDTH_IN, LEFT_IN, RIGHT_IN, PLOT_IN = 6.7, 0.66, 0.14, 1.75
 TITLE_IN, FOOT_IN, LEGEND_IN = 0.2, 0.42, 0.18
@@ -43,22 +41,23 @@ def svg(figure: Figure) -> str:
     with matplotlib.rc_context(SETTINGS):
         entries = figure.legend()
         # As many legend columns as the longest label allows.
-        longest = max((len(e.label) for e in entries), default=0)
+        longest = max(map(len, entries), default=0)
         keys = max(1, min(len(entries), int(WIDTH_IN / (KEY_IN + CHARACTER_IN * longest))))
         heat = figure.heat()
         legend = LEGEND_IN * -(-len(entries) // keys) if len(entries) > 1 else BAR_IN if heat else 0
         places, height = _places(figure, legend)
         canvas = Canvas(figsize=(WIDTH_IN, height))
         # Fixed positions: a layout engine would take most of the computing time of the whole report.
+        drawn: dict[str, Any] = {}
         for panel, place in zip(figure.panels, places, strict=True):
-            _draw(canvas.add_axes(place), panel, figure, place[2] * WIDTH_IN)
+            drawn = _draw(canvas.add_axes(place), panel, figure, place[2] * WIDTH_IN) | drawn
         if heat:
             bar = canvas.add_axes((0.25, (BAR_IN - BAR_HEIGHT_IN) / height, 0.5, BAR_HEIGHT_IN / height))
             _colour_bar(canvas, bar, heat)
         elif legend:
             canvas.legend(
-                [_key(e) for e in entries],
-                [e.label for e in entries],
+                [drawn[label] for label in entries],
+                entries,
                 loc="lower center",
                 borderaxespad=0.1,
                 ncols=keys,
@@ -72,8 +71,7 @@ def svg(figure: Figure) -> str:
 
 def _places(figure: Figure, legend: float) -> tuple[list[tuple[float, float, float, float]], float]:
     """Left, bottom, width and height of each panel as fractions of the canvas, and the canvas height [in]."""
-    columns = figure.columns
-    rows, plot = -(-len(figure.panels) // columns), PLOT_IN * figure.height
+    (rows, columns), plot = figure.grid(), PLOT_IN * figure.height
     words = max((len(word) for panel in figure.panels for _, word in panel.y.ticks), default=0)
     left = max(LEFT_IN, 0.12 + CHARACTER_IN * words + (0.16 if any(p.y.label for p in figure.panels) else 0.0))
     title, foot = (0.18, 0.04) if figure.shared else (TITLE_IN, FOOT_IN)
@@ -105,30 +103,9 @@ def _colour_bar(canvas: Any, place: Any, heat: Heat) -> None:
     bar.outline.set_linewidth(0.5)
 
 
-def _line(style: Style) -> dict[str, Any]:
-    return {"color": style.colour, "linestyle": LINES[style.dash], "linewidth": 0.75 * style.width}
-
-
-def _key(entry: Curve | Band) -> Any:
-    if isinstance(entry, Curve) and entry.bars:
-        return Patch(facecolor=entry.style.colour)
-    if isinstance(entry, Band):
-        return Patch(facecolor=entry.style.colour, alpha=0.25)
-    if not entry.line:
-        return Line2D(
-            [],
-            [],
-            color=entry.style.colour,
-            marker="o",
-            markersize=3.5,
-            linestyle="none",
-            markerfacecolor="none" if entry.hollow else entry.style.colour,
-        )
-    return Line2D([], [], marker="o" if entry.points else None, markersize=3, **_line(entry.style))
-
-
-def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
-    small = figure.shared
+def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> dict[str, Any]:
+    """Draw a panel of the given width [in]; returns what was drawn, by label."""
+    small, drawn = figure.shared, {}
     if panel.heat is not None:
         rows = np.arange(len(panel.heat.z) + 1) - 0.5
         ax.pcolormesh(
@@ -140,28 +117,27 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
             **_colours(panel.heat),
         )
     for band in panel.bands:
-        ax.fill_between(band.x, band.low, band.high, color=band.style.colour, alpha=0.25, linewidth=0)
+        look = {"color": band.style.colour, "alpha": 0.25, "linewidth": 0}
+        drawn[band.label] = ax.fill_between(band.x, band.low, band.high, **look)
     for curve in panel.curves:
-        look = _line(curve.style)
-        if not curve.line:
-            look["linestyle"] = "none"
-        if curve.hollow:
-            look |= {"markerfacecolor": "none", "markersize": 4.5}
         if curve.bars:
             ax.set_axisbelow(True)
-            ax.bar(curve.x, curve.y, curve.bars, color=curve.style.colour)
+            drawn[curve.label] = ax.bar(curve.x, curve.y, curve.bars, color=curve.style.colour)
             continue
         if curve.error is not None:
             error = {f"{curve.along}err": np.where(np.isfinite(curve.error), curve.error, np.nan)}
             ax.errorbar(curve.x, curve.y, **error, fmt="none", ecolor=curve.style.colour, elinewidth=0.9, capsize=1.8)
-        ax.plot(
-            curve.x,
-            np.where(np.isfinite(curve.y), curve.y, np.nan),
-            marker="o" if curve.points else None,
-            **{"markersize": 3, **look},
-        )
-    _scale(ax, "x", panel.x, panel.x.range)
-    _scale(ax, "y", panel.y, log_range(panel) if panel.y.scale == "log" else panel.y.range)
+        look = {
+            "color": curve.style.colour,
+            "linestyle": LINES[curve.style.dash] if curve.line else "none",
+            "linewidth": 0.75 * curve.style.width,
+            "marker": "o" if curve.points else None,
+            "markersize": 4.5 if curve.hollow else 3,
+            "markerfacecolor": "none" if curve.hollow else None,
+        }
+        (drawn[curve.label],) = ax.plot(curve.x, np.where(np.isfinite(curve.y), curve.y, np.nan), **look)
+    _scale(ax, "x", panel.x, limits(panel, "x"))
+    _scale(ax, "y", panel.y, limits(panel, "y"))
     if panel.heat is None:
         ax.grid(True, linewidth=0.4, color="#dddddd")
     if panel.title:
@@ -176,6 +152,7 @@ def _draw(ax: Any, panel: Panel, figure: Figure, width: float) -> None:
         ax.tick_params(labelsize=5.5)
         for axis in (ax.xaxis, ax.yaxis):
             axis.set_minor_locator(matplotlib.ticker.NullLocator())
+    return drawn
 
 
 def _fitting(text: str, room: float, most: float) -> float:
@@ -183,14 +160,14 @@ def _fitting(text: str, room: float, most: float) -> float:
     return max(5.5, min(most, 72 * room / (LETTER * max(len(text), 1))))
 
 
-def _scale(ax: Any, which: str, axis: Axis, limits: tuple[float, float] | None) -> None:
+def _scale(ax: Any, which: str, axis: Axis, ends: tuple[float, float] | None) -> None:
     setter, target = getattr(ax, f"set_{which}scale"), getattr(ax, f"{which}axis")
     setter(axis.scale)
     getattr(ax, f"set_{which}label")(axis.label)
-    if limits is not None:
-        getattr(ax, f"set_{which}lim")(*limits)
-    if axis.scale == "log" and limits is not None:
-        target.set_ticks(*ticks_log(*limits))
+    if ends is not None:
+        getattr(ax, f"set_{which}lim")(*ends)
+    if axis.scale == "log" and ends is not None:
+        target.set_ticks(*ticks_log(*ends))
         target.set_minor_formatter(matplotlib.ticker.NullFormatter())
     if axis.ticks:
         target.set_ticks(*zip(*axis.ticks, strict=True))

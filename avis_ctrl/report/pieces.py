@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from avis_ctrl.report.figures import Figure
 
@@ -45,7 +45,7 @@ class Paragraph:
 class Bullets:
     """A bulleted list."""
 
-    items: tuple[str, ...]
+    items: Sequence[str]
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,7 @@ class Fold:
 
 
 Piece = Heading | Paragraph | Bullets | Formula | Table | Figure | Drawing | Fold
+Content = Piece | Iterable["Content"] | None
 
 
 @dataclass(frozen=True)
@@ -130,30 +131,34 @@ class Document:
         return [p for s in self.sections for p in s.flat() if isinstance(p, (Figure, Drawing))]
 
 
-def document_of(title: str, subtitle: str, provenance: Mapping[str, Any], sections: Iterable[Section]) -> Document:
-    """A report with the date under its title, and version and hash of the inputs in its page header."""
-    date = str(provenance.get("date", ""))[:10]
-    return Document(
-        title,
-        subtitle + (f", {date}" if date else ""),
-        f"avis_ctrl {provenance.get('avis_ctrl', '')}, inputs {str(provenance.get('inputs_sha256', ''))[:12]}",
-        tuple(sections),
-    )
+def section(title: str, anchor: str, *content: Content, alone: bool = False) -> Section:
+    """A `Section` of the pieces in `shown(*content)`."""
+    return Section(title, anchor, shown(*content), alone)
+
+
+def shown(*content: Content) -> tuple[Piece, ...]:
+    """The pieces in order, those of sequences in their place; without None, texts, lists and tables that are empty."""
+    found: list[Piece] = []
+    for one in content:
+        match one:
+            case None | Paragraph("") | Bullets(()) | Fold(_, ()) | Table(_, _, ()):
+                continue
+            case Heading() | Paragraph() | Bullets() | Formula() | Table() | Figure() | Drawing() | Fold():
+                found.append(one)
+            case _:
+                found += shown(*one)
+    return tuple(found)
+
+
+def headed(text: str, *content: Content) -> tuple[Piece, ...]:
+    """Pieces under a heading; empty if there is nothing to show."""
+    pieces = shown(*content)
+    return (Heading(text), *pieces) if pieces else ()
 
 
 def yes_or_no(good: bool) -> Mark:
     """A verdict as "yes" or "no"."""
     return Mark("yes" if good else "no", good)
-
-
-def prose(text: str) -> tuple[Paragraph | Formula, ...]:
-    """Paragraphs and formulas, separated by blank lines; a formula stands in dollar signs, its spoken form follows."""
-    blocks = [" ".join(block.split()) for block in text.strip().split("\n\n")]
-    found: list[Paragraph | Formula] = []
-    for block in blocks:
-        formula, dollar, words = block.removeprefix("$ ").partition(" $ ")
-        found.append(Formula(formula, words) if dollar else Paragraph(block))
-    return tuple(found)
 
 
 def table(caption: str, header: Sequence[str], rows: Sequence[Sequence[Cell]], align: str = "") -> Table:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Heat, Panel, log_range, ticks_log
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Heat, Panel, limits, ticks_log
 
 PANEL_PX, LEGEND_ROW_PX = 300, 22
 
@@ -30,12 +30,13 @@ def graph(figure: Figure) -> dict[str, Any]:
                 in_legend = bool(thing.label) and trace.pop("key") and thing.label not in shown
                 shown.update([thing.label] if in_legend else [])
                 traces.append({**trace, "xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "showlegend": in_legend})
-    found = {"data": traces, "layout": _layout(figure, figure.columns)}
-    return found | {"narrow": _layout(figure, 1)} if figure.columns > 1 and not figure.shared else found
+    rows, columns = figure.grid()
+    found = {"data": traces, "layout": _layout(figure, rows, columns)}
+    narrow = columns > 1 and not figure.shared
+    return found | {"narrow": _layout(figure, len(figure.panels), 1)} if narrow else found
 
 
-def _layout(figure: Figure, columns: int) -> dict[str, Any]:
-    rows = -(-len(figure.panels) // columns)
+def _layout(figure: Figure, rows: int, columns: int) -> dict[str, Any]:
     layout: dict[str, Any] = {
         "height": round(PANEL_PX * figure.height * rows) + 90 + LEGEND_ROW_PX * (len(figure.legend()) // 3),
         "annotations": [],
@@ -55,9 +56,13 @@ def _layout(figure: Figure, columns: int) -> dict[str, Any]:
         small = {"tickfont": {"size": 9}} if figure.shared else {}
         bars = {"barmode": "overlay"} if any(c.bars for c in panel.curves) else {}
         layout |= bars
-        layout[f"xaxis{suffix}"] = {**_axis(panel.x, panel.x.range), "anchor": f"y{suffix}", **side, **small}
-        limits = log_range(panel) if panel.y.scale == "log" else panel.y.range
-        layout[f"yaxis{suffix}"] = {**_axis(panel.y, limits), "anchor": f"x{suffix}", "domain": domain, **small}
+        layout[f"xaxis{suffix}"] = {**_axis(panel.x, limits(panel, "x")), "anchor": f"y{suffix}", **side, **small}
+        layout[f"yaxis{suffix}"] = {
+            **_axis(panel.y, limits(panel, "y")),
+            "anchor": f"x{suffix}",
+            "domain": domain,
+            **small,
+        }
         room = PANEL_PX * figure.height * (1.0 if rows == 1 else 0.75)
         if len(panel.y.label) * 7 > room:
             layout[f"yaxis{suffix}"]["title"]["font"] = {"size": 10}
@@ -79,36 +84,31 @@ def _numbers(values: np.ndarray) -> list[float | None]:
 
 
 def _curve(curve: Curve) -> dict[str, Any]:
-    mode = "+".join(["lines"] * curve.line + ["markers"] * curve.points)
-    return {
+    colour = {"color": curve.style.colour}
+    trace: dict[str, Any] = {
         "type": "scatter",
-        "mode": mode,
+        "mode": "+".join(["lines"] * curve.line + ["markers"] * curve.points),
         "x": _numbers(curve.x),
         "y": _numbers(curve.y),
         "name": _text(curve.label),
         "legendgroup": curve.label,
         "key": True,
-        "marker": {"size": 6, "color": curve.style.colour},
-        "line": {"color": curve.style.colour, "dash": curve.style.dash, "width": curve.style.width},
-    } | _more(curve)
-
-
-def _more(curve: Curve) -> dict[str, Any]:
-    """Hollow markers, error bars, and bars in place of a line."""
-    more: dict[str, Any] = {}
+        "marker": {"size": 6, **colour},
+        "line": {"dash": curve.style.dash, "width": curve.style.width, **colour},
+    }
     if curve.hollow:
-        more["marker"] = {"size": 8, "color": curve.style.colour, "symbol": "circle-open", "line": {"width": 1.6}}
+        trace["marker"] = {"size": 8, "symbol": "circle-open", "line": {"width": 1.6}, **colour}
     if curve.error is not None:
-        more[f"error_{curve.along}"] = {
+        trace[f"error_{curve.along}"] = {
             "type": "data",
             "array": _numbers(curve.error),
-            "color": curve.style.colour,
             "thickness": 1.3,
             "width": 3,
+            **colour,
         }
     if curve.bars:
-        more |= {"type": "bar", "width": curve.bars, "marker": {"color": curve.style.colour}}
-    return more
+        trace |= {"type": "bar", "width": curve.bars, "marker": colour}
+    return trace
 
 
 def _band(band: Band) -> list[dict[str, Any]]:
@@ -172,16 +172,16 @@ def _colour_bar(heat: Heat) -> dict[str, Any]:
     return {"cmin": low, "cmax": high, "colorscale": [list(stop) for stop in heat.colours], "colorbar": bar}
 
 
-def _axis(axis: Axis, limits: tuple[float, float] | None) -> dict[str, Any]:
+def _axis(axis: Axis, ends: tuple[float, float] | None) -> dict[str, Any]:
     found: dict[str, Any] = {
         "title": {"text": _text(axis.label), "standoff": 6},
         "type": axis.scale,
         "automargin": True,
     }
-    if limits is not None:
-        found["range"] = [float(np.log10(v)) for v in limits] if axis.scale == "log" else list(limits)
-    if axis.scale == "log" and limits is not None:
-        values, text = ticks_log(*limits)
+    if ends is not None:
+        found["range"] = [float(np.log10(v)) for v in ends] if axis.scale == "log" else list(ends)
+    if axis.scale == "log" and ends is not None:
+        values, text = ticks_log(*ends)
         found |= {"tickvals": values, "ticktext": text, "tickmode": "array"}
     if axis.ticks:
         found |= {

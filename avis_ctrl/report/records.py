@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader, in_short
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Bullets, Heading, Piece, Table, listed
+from avis_ctrl.report.pieces import Bullets, Piece, Table, headed, listed
 
 
 def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:
@@ -35,7 +35,6 @@ def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:
     )
 
 
-def remarks(campaign: Campaign) -> list[Piece]:
+def remarks(campaign: Campaign) -> tuple[Piece, ...]:
     """Assumptions made in reading the file; empty if there are none."""
-    told = tuple(in_short(campaign.notes))
-    return [Heading("Notes on the measurement file"), Bullets(told)] if told else []
+    return headed("Notes on the measurement file", Bullets(tuple(in_short(campaign.notes))))

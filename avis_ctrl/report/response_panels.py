@@ -3,28 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.identification.overlays import MeasuredOverlay
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log_limits, markers
+from avis_ctrl.report.settings import SETTINGS
 
 FLOOR = ("vx", "vy", "vz")
 MEASURED, SCATTER, TWO_SIGMA = Style("#222222"), Style("#7a7a7a"), Style("#222222", "dot", 1.4)
 # Label, response (n, n_y, n_u), style.
 Model = tuple[str, np.ndarray, Style]
-
-
-@dataclass(frozen=True)
-class PanelSettings:
-    """points : maximum number of points of a measured response in a panel: more would hide the lines of the models."""
-
-    points: int = 60
-
-
-SETTINGS = PanelSettings()
 
 
 def drives(seen: MeasuredOverlay) -> list[int]:
@@ -39,12 +29,7 @@ def unit(seen: MeasuredOverlay, j: int) -> str:
     return words.unit(f"{output}/{f'({per})' if '/' in per or ' ' in per else per}")
 
 
-def frequencies(seen: MeasuredOverlay) -> Axis:
-    """Frequency axis of all panels of an overlay."""
-    return hertz(float(seen.frequency_Hz[0]), float(seen.frequency_Hz[-1]))
-
-
-def thin(count: int, most: int = SETTINGS.points) -> np.ndarray:
+def thin(count: int, most: int = SETTINGS.measured_points) -> np.ndarray:
     """Indices of at most `most` of `count` points, evenly spaced."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
@@ -65,9 +50,7 @@ def magnitude(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) ->
         *(Curve(f, line, label, style) for label, line, style in lines),
     )
     band = Band(f, np.maximum(size - two, low), np.maximum(size + two, low), "measured, ± 2 σ", SCATTER)
-    return Panel(
-        frequencies(seen), Axis(f"magnitude [{unit(seen, j)}]", "log", (low, high)), curves, (band,), title(seen, i, j)
-    )
+    return Panel(hertz(), Axis(f"magnitude [{unit(seen, j)}]", "log", (low, high)), curves, [band], title(seen, i, j))
 
 
 def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -> Panel:
@@ -79,4 +62,4 @@ def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -
         *(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
         Curve(f, two, "two standard deviations of the measured", TWO_SIGMA),
     )
-    return Panel(frequencies(seen), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))
+    return Panel(hertz(), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))

@@ -110,11 +110,8 @@ def _labels(canvas: Canvas, rig: Rig, at: View) -> None:
 def _side(canvas: Canvas, rig: Rig, reach: np.ndarray, at: View) -> None:
     canvas.text((16, TOP_HEIGHT + 22), "from the side, along −x", 13, anchor="start", bold=True)
     _axes(canvas, (30, TOP_HEIGHT + 110), ("y", "z"))
-    isolators = {
-        (round(p.position[1], 6), round(p.position[2], 6)): p.position
-        for p in rig.points().values()
-        if p.kind == "isolator"
-    }
+    tops = [p.position for p in rig.points().values() if p.kind == "isolator"]
+    isolators = {tuple(np.round(top[1:], 6)): top for top in tops}
     foot = min(at(p)[1] for p in isolators.values())
     lower, upper = max(at(p)[1] for p in isolators.values()), at(np.array([0.0, 0.0, 0.05]))[1]
     left, right = at(-reach)[0] - 22, at(reach)[0] + 22

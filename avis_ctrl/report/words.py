@@ -96,8 +96,8 @@ def axis(name: str) -> str:
 
 
 def unit(text: str) -> str:
-    """A unit with superscript powers."""
-    return text.replace("^2", "²").replace("^3", "³")
+    """A unit with superscript powers; empty for the unit 1."""
+    return "" if text in ("1", "mixed units") else text.replace("^2", "²").replace("^3", "³")
 
 
 def yes(value: bool) -> str:
@@ -106,8 +106,11 @@ def yes(value: bool) -> str:
 
 
 def sentence(text: str) -> str:
-    """Text as a sentence: capital first letter and a full stop at the end."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+    """Text as a sentence: capital first letter, except of a name with an underscore, and a full stop at the end."""
+    text = text.replace(" +- ", " ± ").strip()
+    first = text.partition(" ")[0].rstrip(":;,.")
+    text = text if "_" in first else text[:1].upper() + text[1:]
+    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
 def joined(names: list[str] | tuple[str, ...]) -> str:

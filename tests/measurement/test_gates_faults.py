@@ -220,4 +220,4 @@ def test_figures_name_the_channels(clean):
     figure = figure_of("a", "b", [said.picture])
     names = (*clean.u_names, *clean.y_names)
     assert [word.strip() for _, word in figure.panels[0].x.ticks] == list(names)
-    assert [thing.label for thing in figure.legend()] == ["converter"]
+    assert figure.legend() == ["converter"]

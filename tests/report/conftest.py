@@ -1,16 +1,24 @@
-"""A small design result: the shipped plant with a plain velocity feedback, its bounds made up."""
+"""Small results for reports: of a design (the shipped plant with a plain velocity feedback, its bounds made up), of an
+identification, and of a gap.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import gap_stand_in
 import numpy as np
 import pytest
+from reading import Written, written
 
 from avis_ctrl.classical.skyhook import Skyhook
+from avis_ctrl.report.content import document as design_document
+from avis_ctrl.report.gap.content import document as gap_document
+from avis_ctrl.report.identification.content import document as identification_document
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn_state import Iteration
+from avis_ctrl.simulation.rehearsal import rehearse
 from avis_ctrl.study.design_file import read_design
 from avis_ctrl.study.design_result import (
     Bound,
@@ -21,6 +29,8 @@ from avis_ctrl.study.design_result import (
     SixDofCheck,
     Transmissibility,
 )
+from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
+from avis_ctrl.study.plan_file import plan_from_table
 from avis_ctrl.study.plant import DesignPlant, build_plant
 
 DESIGN = Path(__file__).parents[2] / "designs" / "avis_z_phix.toml"
@@ -31,6 +41,16 @@ TITLES = {
     "skyhook_classical": "skyhook, critical damping",
     "hinf": "H-infinity, nominal",
     "mu": "mu synthesis",
+}
+
+FREE = ("mass", "isolator*.k_x", "isolator*.k_z", "isolator1.c_z")
+PLAN = {
+    "title": "small",
+    "duration_s": 8.0,
+    "settle_s": 2.0,
+    "band_Hz": [1.0, 20.0],
+    "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
+    "record": [{"excitation": "noise", "records": 3}, {"excitation": "rest"}],
 }
 
 
@@ -127,3 +147,31 @@ def fabricated() -> DesignResult:
         12.5,
         ("a remark",),
     )
+
+
+@pytest.fixture(scope="session")
+def identified() -> Identification:
+    """A small campaign: three records of noise and one at rest."""
+    rig = load_rig("avis")
+    campaign = rehearse(rig, plan_from_table(PLAN), seed=2).campaign
+    return identify(campaign, rig, IdentifyOptions(parameters=FREE, starts=1, despite_gates=True))
+
+
+@pytest.fixture(scope="session")
+def gap_found() -> gap_stand_in.Finds:
+    return gap_stand_in.finding(gap_stand_in.records())
+
+
+@pytest.fixture(scope="session")
+def design_report(fabricated: DesignResult) -> Written:
+    return written(design_document(fabricated))
+
+
+@pytest.fixture(scope="session")
+def identification_report(identified: Identification) -> Written:
+    return written(identification_document(identified))
+
+
+@pytest.fixture(scope="session")
+def gap_report(gap_found: gap_stand_in.Finds) -> Written:
+    return written(gap_document(gap_found))

@@ -53,6 +53,6 @@ def test_the_gate_finds_an_offset_and_no_other(examples, monkeypatch):
 def test_the_section_is_drawn_in_both(examples, fabricated, monkeypatch):
     monkeypatch.setattr(content, "SECTIONS", (*content.SECTIONS, examples["drives"]))
     document = content.document(fabricated)
-    assert document.sections[-1].title == "Drives"
+    assert [s.title for s in document.sections[-2:]] == ["Drives", "Provenance"]
     assert b"Largest voltage, once in ten minutes." in html.render(document)
     assert pdf.render(document).startswith(b"%PDF")

@@ -9,29 +9,26 @@ from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.opening import named
 from avis_ctrl.report.identification.gates import figure_of
-from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Piece, Section, document_of, listed, table
-from avis_ctrl.report.sections.provenance import provenance_table
+from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Section, listed, section, table
+from avis_ctrl.report.provenance import document_of
 
 
 def document(gap: AxisGap, source: str, provenance: Mapping[str, object]) -> Document:
     """The report of the gap of a single-axis model. source : name of the measurement."""
-    told = {"seconds": round(gap.seconds, 2), **provenance}
     return document_of(
         f"Gap between a model of one axis and its measurement: {gap.kind}",
         f"Measurement: {source}",
-        told,
-        (
-            _summary(gap),
-            _model(gap),
-            _remaining(gap),
-            provenance_table(told, "The same measurement, options and library versions give the same figures."),
-        ),
+        {"seconds": round(gap.seconds, 2), **provenance},
+        (_summary(gap), _model(gap), _remaining(gap)),
+        "The same measurement, options and library versions give the same figures.",
     )
 
 
 def _summary(gap: AxisGap) -> Section:
-    first, *rest = gap.sentences
-    pieces: list[Piece] = [
+    (first, *rest), further = gap.sentences, gap.next_experiment
+    return section(
+        "Summary",
+        "finding",
         wording.verdict(f"Verdict: {gap.verdict}. {first}", gap.verdict),
         listed(
             "Error of each model on data that no fit has used, r.m.s., relative to the measured signal. Each row "
@@ -44,12 +41,11 @@ def _summary(gap: AxisGap) -> Section:
             },
         ),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1], height=0.7),
-    ]
-    if gap.effects or gap.traces:
-        pieces.append(named(gap, ""))
-    if gap.next_experiment:
-        pieces.append(Paragraph(f"What would distinguish them: {wording.said(gap.next_experiment)}"))
-    return Section("Summary", "finding", (*pieces, Bullets(tuple(map(wording.said, rest)))), alone=True)
+        named(gap, ""),
+        Paragraph(f"What would distinguish them: {words.sentence(further)}") if further else None,
+        Bullets(list(map(words.sentence, rest))),
+        alone=True,
+    )
 
 
 def _model(gap: AxisGap) -> Section:
@@ -68,7 +64,7 @@ def _model(gap: AxisGap) -> Section:
         },
         "llr",
     )
-    return Section("The updated model", "model", (values, others) if gap.runners_up else (values,))
+    return section("The updated model", "model", values, others)
 
 
 def _remaining(gap: AxisGap) -> Section:
@@ -87,4 +83,4 @@ def _remaining(gap: AxisGap) -> Section:
         "llr",
     )
     lines = figure_of("lines", "Residual of the base model and of the updated model.", gap.pictures[1:2])
-    return Section("What remains", "remaining", (residual, where, lines))
+    return section("What remains", "remaining", residual, where, lines)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,74 +23,54 @@ from avis_ctrl.report.figures import (
     steps,
 )
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, section, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
 
 
-@dataclass(frozen=True)
-class BeforeAfterSettings:
-    """pairs : number of outputs, the worst, whose response is drawn: their figures fill a page.
-    letters : letters per row of a stage's name under its bar, so that four names fit side by side on a phone.
-    """
-
-    pairs: int = 3
-    letters: int = 13
-
-
-SETTINGS = BeforeAfterSettings()
-
-
 def before_after(found: GapFinding) -> Section:
     """Errors on held-out data as figures and numbers, and measured responses compared with both models."""
     gap = found.gap
-    pieces: list[Piece] = []
-    if gap.heat is not None:
-        pieces.append(spectrum(gap.heat, bool(gap.effects)))
-    pieces.append(_stages(gap))
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
-    pieces += [Paragraph(seen, "note")] if isinstance(seen, str) else responses(seen, bool(gap.effects))
-    return Section("The gap before and after" if gap.effects else "The gap", "before_after", tuple(pieces))
+    return section(
+        "The gap before and after" if gap.effects else "The gap",
+        "before_after",
+        spectrum(gap.heat, bool(gap.effects)) if gap.heat is not None else None,
+        _stages(gap),
+        Paragraph(seen, "note") if isinstance(seen, str) else responses(seen, bool(gap.effects)),
+    )
 
 
 def spectrum(heat: HeatMap, named: bool) -> Figure:
     """Residual power over noise power by frequency: mean of all channels, and worst channel."""
     edges, panels = heat.bands_Hz, []
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
-    x, y = hertz(float(edges[0]), float(edges[-1])), Axis("residual / noise power [-]", "log")
-    for title, reduce in (("Mean of all channels", _mean), ("Worst channel of each band", _worst)):
-        curves = [Curve(*steps(edges, reduce(values)), label, style) for label, values, style in sides]
+    for title, reduce in (("Mean of all channels", np.ma.mean), ("Worst channel of each band", np.ma.max)):
+        curves = []
+        for label, values, style in sides:
+            reduced = np.ma.filled(reduce(np.ma.masked_invalid(values), axis=1), np.nan)
+            curves.append(Curve(*steps(edges, reduced), label, style))
         curves.append(level(edges[0], edges[-1], 1.0, "noise alone", NOISE))
-        panels.append(Panel(x, y, tuple(curves), (), title))
+        panels.append(Panel(hertz(), Axis("residual / noise power [-]", "log"), curves, (), title))
     return Figure(
         "gap_spectrum",
         "The gap on held-out data: power of the residual relative to that of the "
         "measured noise, by frequency band. For a complete model the mean is 1, and the worst of "
         f"{heat.before.shape[1]} channels is a little above.",
-        tuple(panels),
+        panels,
         2,
         0.95,
     )
 
 
-def _mean(values: np.ndarray) -> np.ndarray:
-    known = np.isfinite(values)
-    count = np.maximum(known.sum(axis=1), 1)
-    return np.where(known.any(axis=1), np.where(known, values, 0.0).sum(axis=1) / count, np.nan)
-
-
-def _worst(values: np.ndarray) -> np.ndarray:
-    known = np.isfinite(values)
-    return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
-
-
 def ladder(gap: Gap) -> Figure:
     """Error of each stage as a bar, and the error due to noise alone as a line."""
     values = np.array([100 * one.nrmse for one in gap.stages])
-    place, axis = places([textwrap.fill(rung(one.name, k), SETTINGS.letters) for k, one in enumerate(gap.stages)])
+    place, axis = places([textwrap.fill(rung(one.name, k), SETTINGS.stage_letters) for k, one in enumerate(gap.stages)])
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
@@ -100,7 +79,7 @@ def ladder(gap: Gap) -> Figure:
     return Figure(
         "ladder",
         "Normalised r.m.s. error of each stage on held-out data, and that of the noise alone. Logarithmic scale.",
-        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), (errors, *lines)),),
+        [Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), [errors, *lines])],
         height=0.7,
     )
 
@@ -167,7 +146,7 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
         f"Left: magnitude, {points} with a band of two standard deviations to "
         "each side. Right: magnitude of the complex difference between measured and model; with noise "
         "alone 86 % of the points lie below the dotted line.",
-        tuple(panels),
+        panels,
         2,
         0.68,
     )
@@ -180,4 +159,4 @@ def worst_pairs(seen: GapOverlay) -> list[tuple[int, int]]:
         far = np.abs(seen.measured - seen.baseline) ** 2 / seen.measured_std**2
     size = np.mean(np.where(np.isfinite(far), far, 0.0), axis=0)
     best = [(i, max(drives(seen), key=lambda j: size[i, j])) for i in range(len(seen.outputs))]
-    return sorted(best, key=lambda pair: -size[pair])[: SETTINGS.pairs]
+    return sorted(best, key=lambda pair: -size[pair])[: SETTINGS.worst_outputs]

@@ -8,19 +8,14 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Panel, Style, bars, level, places
-from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Section, listed, yes_or_no
-from avis_ctrl.study.gap import GapFinding
+from avis_ctrl.report.pieces import Bullets, Mark, Paragraph, Section, listed, section, yes_or_no
 
 if TYPE_CHECKING:
     from avis_ctrl.study.gap_design import DesignEffect, LoopFigures
 
 
-def controller(found: GapFinding) -> Section | None:
-    """The previous controller with both models, and a new one; None if no design was requested."""
-    effect = found.design
-    if effect is None:
-        return None
-    first, further = effect.sentences[:1], effect.sentences[1:]
+def controller(effect: DesignEffect) -> Section:
+    """The previous controller with both models, and a new one."""
     judged = listed(
         "An upper bound of mu below 1 guarantees the specified performance for every table of the design's "
         "uncertainty set. Decibels are those of the largest singular value from floor to payload. Worst cases are "
@@ -41,8 +36,8 @@ def controller(found: GapFinding) -> Section | None:
         },
         "llccrrrrr",
     )
-    more = [Bullets(tuple(further))] if further else []
-    return Section("Effect on the controller", "controller", (*map(Paragraph, first), judged, _bounds(effect), *more))
+    first, further = map(Paragraph, effect.sentences[:1]), Bullets(effect.sentences[1:])
+    return section("Effect on the controller", "controller", first, judged, _bounds(effect), further)
 
 
 class Loop(NamedTuple):
@@ -74,17 +69,12 @@ def _bounds(effect: DesignEffect) -> Figure:
         else ""
     )
     top = 1.15 * max(1.0, float(np.max(mu[np.isfinite(mu)], initial=0.0)))
+    limit = level(-0.5, len(mu) - 0.5, 1.0, "limit")
     drawn_mu = bars(place, mu, "upper bound of mu", Style("#8fbbdc"), 0.5)
     return Figure(
         "gap_mu",
         "Upper bound of mu (robust performance) of each controller with each model; below 1 the "
         f"specified performance is guaranteed for every table of the set.{lost}",
-        (
-            Panel(
-                axis,
-                Axis("mu, upper bound [-]", "linear", (0.0, top)),
-                (drawn_mu, level(-0.5, len(mu) - 0.5, 1.0, "limit")),
-            ),
-        ),
+        [Panel(axis, Axis("mu, upper bound [-]", "linear", (0.0, top)), [drawn_mu, limit])],
         height=0.7,
     )

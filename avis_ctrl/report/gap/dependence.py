@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,31 +10,17 @@ from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, markers, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
-from avis_ctrl.report.pieces import Fold, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, Table, headed, section, shown, table
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 
-
-@dataclass(frozen=True)
-class DependenceSettings:
-    """least_drawn : smallest fraction of the power that is drawn [1], -90 dB."""
-
-    least_drawn: float = 1e-9
-
-
-SETTINGS = DependenceSettings()
+# Of each part of the power: label and style of its curve, and header of its column.
 LOOKS = {
-    "model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4)),
-    "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8)),
-    "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8)),
-    "unmeasured": ("unmeasured inputs", Style("#0072b2", "dashdot", 1.6)),
-    "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6)),
-}
-COLUMNS = {
-    "model": "model",
-    "missing": "linear, not in the model",
-    "nonlinear": "not linear",
-    "unmeasured": "unmeasured inputs",
-    "sensors": "sensors' noise",
+    "model": ("model, linear in measured inputs", Style("#222222", "solid", 1.4), "model"),
+    "missing": ("linear, missing from the model", Style("#d55e00", "dash", 1.8), "linear, not in the model"),
+    "nonlinear": ("not linear (amplitude, time)", Style("#009e73", "solid", 1.8), "not linear"),
+    "unmeasured": ("unmeasured inputs", Style("#0072b2", "dashdot", 1.6), "unmeasured inputs"),
+    "sensors": ("sensors' own noise", Style("#7a7a7a", "dot", 1.6), "sensors' noise"),
 }
 HOW = {
     "silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; any power of the "
@@ -54,19 +39,16 @@ def dependence(found: GapFinding) -> Section:
     """The residual of each record by level and by time, and the decomposition of the power of the outputs."""
     gap = found.gap
     no_shares = "No fractions of power were computed: the driven records have too few lines for their inputs."
-    pieces: list[Piece] = [
-        by_record(gap),
-        Heading("Coherence: what noise, nonlinearity and unmeasured inputs account for"),
-        *(coherence(gap.shares) if gap.shares else [Paragraph(no_shares, "note")]),
-    ]
-    return Section("Level, time and coherence", "dependence", tuple(pieces))
+    heading = "Coherence: what noise, nonlinearity and unmeasured inputs account for"
+    decomposed = coherence(gap.shares) if gap.shares else Paragraph(no_shares, "note")
+    return section("Level, time and coherence", "dependence", by_record(gap), headed(heading, decomposed))
 
 
 def by_record(gap: Gap) -> Figure:
     """Residual over noise of every record, by level and by time; filled markers for held-out records."""
     panels = (
-        _panel(gap, "By level", Axis("level of the drives, r.m.s. [V]"), lambda one: one.level_V),
-        _panel(gap, "By time", Axis("start of the record, time [s]"), lambda one: one.start_s),
+        _panel(gap, "By level", "level of the drives, r.m.s. [V]", lambda one: one.level_V),
+        _panel(gap, "By time", "start of the record, time [s]", lambda one: one.start_s),
     )
     return Figure(
         "gap_records",
@@ -81,7 +63,7 @@ def by_record(gap: Gap) -> Figure:
     )
 
 
-def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> Panel:
+def _panel(gap: Gap, title: str, x: str, of: Callable[[RecordGap], float]) -> Panel:
     sides: list[tuple[str, Style, Callable[[RecordGap], float]]] = [("re-identified", BEFORE, lambda one: one.before)]
     if gap.effects:
         sides.append(("updated", AFTER, lambda one: one.after))
@@ -102,7 +84,7 @@ def _panel(gap: Gap, title: str, x: Axis, of: Callable[[RecordGap], float]) -> P
     curves.append(level(low, high, 1.0, "noise alone", NOISE))
     values = np.array([1.0, *(v for one in gap.records for v in (one.before, one.after))])
     y = Axis("residual / noise, r.m.s. [-]", "log", log_limits(values, 1 / 1.5, 1.5))
-    return Panel(Axis(x.label, "linear", (low, high)), y, tuple(curves), (), title)
+    return Panel(Axis(x, "linear", (low, high)), y, curves, (), title)
 
 
 def _limits(values: Sequence[float]) -> tuple[float, float]:
@@ -111,13 +93,12 @@ def _limits(values: Sequence[float]) -> tuple[float, float]:
     return low - room, high + room
 
 
-def coherence(shares: tuple[PowerShares, ...]) -> list[Piece]:
+def coherence(shares: tuple[PowerShares, ...]) -> tuple[Piece, ...]:
     """Decomposition of the power at the highest level as figure and table, and at the lowest level in a fold."""
     lowest, top = shares[0], shares[-1]
-    pieces: list[Piece] = [Paragraph(_explained(top)), figure(top, "gap_coherence"), _whole(top)]
-    if len(shares) > 1:
-        pieces.append(Fold("The same at the lowest level", (figure(lowest, "gap_coherence_lowest"), _whole(lowest))))
-    return pieces
+    low = (figure(lowest, "gap_coherence_lowest"), _whole(lowest)) if len(shares) > 1 else ()
+    pieces = (Paragraph(_explained(top)), figure(top, "gap_coherence"), _whole(top))
+    return shown(pieces, Fold("The same at the lowest level", low))
 
 
 def _explained(one: PowerShares) -> str:
@@ -139,23 +120,23 @@ def figure(one: PowerShares, name: str) -> Figure:
     """One panel per output, with fractions of its power on a logarithmic axis."""
     edges = np.asarray(one.bands_Hz, float)
     drawn = {
-        key: np.where(np.isfinite(share) & (share > SETTINGS.least_drawn), share, np.nan)
+        key: np.where(np.isfinite(share) & (share > SETTINGS.least_power), share, np.nan)
         for key, share in one.shares.items()
     }
     positive = np.concatenate([share[np.isfinite(share)] for share in drawn.values()])
     low = float(10 ** np.floor(np.log10(positive.min(initial=0.1))))
-    x, y = hertz(float(edges[0]), float(edges[-1])), Axis("fraction of the power [-]", "log", (low, 2.0))
+    y = Axis("fraction of the power [-]", "log", (low, 2.0))
     panels = []
     for k, output in enumerate(one.outputs):
-        looks = [(drawn[key][:, k], *look) for key, look in LOOKS.items() if key in drawn]
-        curves = tuple(Curve(*steps(edges, share), label, style) for share, label, style in looks)
-        panels.append(Panel(x, y, curves, (), output))
+        looks = [(drawn[key][:, k], look) for key, look in LOOKS.items() if key in drawn]
+        curves = [Curve(*steps(edges, share), label, style) for share, (label, style, _) in looks]
+        panels.append(Panel(hertz(), y, curves, (), output))
     return Figure(
         name,
         f"What accounts for the power of each output at {words.number(one.level_V)} V r.m.s. "
         f"({one.excitation}, records {', '.join(one.records)}), by frequency; the fractions of a band add up to 1. A "
         "line that ends is below what can be determined.",
-        tuple(panels),
+        panels,
         2,
         0.72,
     )
@@ -171,7 +152,7 @@ def _whole(one: PowerShares) -> Table:
     return table(
         f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
         "lies at the resonances.",
-        ("output", *(COLUMNS[key] for key in keys)),
+        ("output", *(LOOKS[key][2] for key in keys)),
         rows,
         "l" + "r" * len(keys),
     )

@@ -11,7 +11,7 @@ from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.gap.table_model import inseparable_parameters
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Section, Table, section, shown, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.gap import GapFinding
 
@@ -19,25 +19,20 @@ from avis_ctrl.study.gap import GapFinding
 def parameters(found: GapFinding) -> Section:
     """Sizes with standard deviations, confirmation of each effect, and the rig's parameters with and without them."""
     gap = found.gap
-    pieces: list[Piece] = []
-    if gap.effects or gap.traces:
-        pieces += [_sizes(gap), Bullets(tuple(_as_text(one) for one in (*gap.effects, *gap.traces)))]
-    else:
-        pieces.append(
-            Paragraph(
-                "No effect is named: the updated model is the re-identified rig, with the tolerances of its values as "
-                "priors."
-            )
-        )
-    if len(gap.baseline.values):
-        both = " and updated" if gap.effects else ""
-        groups = inseparable_parameters(gap.baseline)
-        pieces.append(
-            Fold(
-                f"The rig's own parameters, re-identified{both}", (_rig(gap, groups), *_together(groups), *_always(gap))
-            )
-        )
-    return Section("Parameters", "parameters", (*pieces, *tolerances(gap.tolerances)))
+    named = (*gap.effects, *gap.traces)
+    none = (
+        "No effect is named: the updated model is the re-identified rig, with the tolerances of its values as priors."
+    )
+    both = " and updated" if gap.effects else ""
+    groups = inseparable_parameters(gap.baseline) if len(gap.baseline.values) else []
+    own = shown(_rig(gap, groups), _together(groups), _always(gap))
+    return section(
+        "Parameters",
+        "parameters",
+        (_sizes(gap), Bullets(list(map(_as_text, named)))) if named else Paragraph(none),
+        Fold(f"The rig's own parameters, re-identified{both}", own),
+        tolerances(gap.tolerances),
+    )
 
 
 def _sizes(gap: Gap) -> Table:
@@ -46,7 +41,7 @@ def _sizes(gap: Gap) -> Table:
         for name, p in one.parameters.items():
             value, sigma = words.with_std(p.value, p.std)
             spread = f"± {sigma}" if np.isfinite(p.std) and p.std > 0 else "none"
-            rows.append((one.name, one.location, name, value, spread, "" if p.unit == "1" else words.unit(p.unit)))
+            rows.append((one.name, one.location, name, value, spread, words.unit(p.unit)))
     return table(
         "Parameters of the named effects. Those of mechanical and drive effects are fitted together with all "
         "parameters of the rig and all tolerances; their standard deviation includes the noise and what no effect "
@@ -64,7 +59,7 @@ def _as_text(one: NamedEffect) -> str:
     if effect is not None:
         text += f" Influence on the responses: {effect.looks_like}."
     if one.confirmation:
-        text += f" {one.confirmation[:1].upper()}{one.confirmation[1:].rstrip('.')}."
+        text += f" {words.sentence(one.confirmation)}"
     if one.indistinguishable_from:
         names = words.joined(list(map(wording.titled, one.indistinguishable_from)))
         text += f" These data cannot distinguish it from {names}."
@@ -100,17 +95,17 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
     )
 
 
-def _together(groups: Sequence[Sequence[str]]) -> list[Piece]:
+def _together(groups: Sequence[Sequence[str]]) -> Paragraph | None:
     """Parameters that no record determines individually."""
     told = "; ".join(words.joined(list(group)) for group in groups)
     text = (
         f"No record can determine {told} individually, only in combination. Their individual values follow from the "
         "combination and the rig file."
     )
-    return [Paragraph(text, "note")] if groups else []
+    return Paragraph(text, "note") if groups else None
 
 
-def _always(gap: Gap) -> list[Piece]:
+def _always(gap: Gap) -> Paragraph | None:
     """Second-order terms of large rotations, which are part of every model and not an effect."""
     sigma, told = _deviations(gap), []
     for name, value in zip(gap.updated.names, gap.updated.values, strict=True):
@@ -122,7 +117,7 @@ def _always(gap: Gap) -> list[Piece]:
         "exist in every table. Their factors, 0 or 1 in theory, are fitted as well and are often poorly determined: "
         f"{'; '.join(told)}."
     )
-    return [Paragraph(text, "note")] if told else []
+    return Paragraph(text, "note") if told else None
 
 
 def _deviations(gap: Gap) -> dict[str, float]:

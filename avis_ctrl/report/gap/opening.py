@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from avis_ctrl.gap.axis.result import AxisGap
@@ -12,7 +10,9 @@ from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import ladder
 from avis_ctrl.report.gap.remaining import next_step
-from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed
+from avis_ctrl.report.identification.gates import warnings
+from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, listed, section
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 
 CHANCES = (
@@ -22,40 +22,28 @@ CHANCES = (
 )
 
 
-@dataclass(frozen=True)
-class OpeningSettings:
-    """parameters : maximum number of an effect's parameters in a row; the section on parameters lists all."""
-
-    parameters: int = 5
-
-
-SETTINGS = OpeningSettings()
-
-
 def opening(found: GapFinding) -> Section:
     """Verdict, the gap in numbers, named effects."""
     gap = found.gap
-    first, *more = map(wording.said, gap.sentences)
-    pieces: list[Piece] = [
+    first, *more = map(words.sentence, gap.sentences)
+    limits = "The section on the residual lists the detection limits of the effects."
+    warned = words.joined(warnings(found.findings))
+    gates = f"Gates that warned of the records: {warned}; see the section on gates."
+    return section(
+        "Summary",
+        "result",
         wording.verdict(first, gap.verdict),
         Paragraph(wording.claim(gap)),
         Paragraph(in_numbers(gap)),
         ladder(gap),
-    ]
-    if gap.effects or gap.traces:
-        pieces.append(named(gap, CHANCES))
-    pieces += [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from]
-    if gap.detectable:
-        pieces.append(Paragraph("The section on the residual lists the detection limits of the effects."))
-    if more:
-        pieces.append(Bullets(tuple(more)))
-    pieces.append(Paragraph(f"What to measure next: {next_step(found)}"))
-    warned = list(dict.fromkeys(f.gate for f in found.findings if f.severity in ("warning", "stop")))
-    if warned:
-        pieces.append(
-            Paragraph(f"Gates that warned of the records: {words.joined(warned)}; see the section on gates.", "note")
-        )
-    return Section("Summary", "result", tuple(pieces), alone=True)
+        named(gap, CHANCES),
+        [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from],
+        Paragraph(limits) if gap.detectable else None,
+        Bullets(more),
+        Paragraph(f"What to measure next: {next_step(found)}"),
+        Paragraph(gates, "note") if warned else None,
+        alone=True,
+    )
 
 
 def in_numbers(gap: Gap) -> str:

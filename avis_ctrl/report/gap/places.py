@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,36 +10,21 @@ from avis_ctrl.gap.result import Gap, HeatMap, Where
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, listed
+from avis_ctrl.report.pieces import Paragraph, Section, Table, listed, section
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
-
-
-@dataclass(frozen=True)
-class MapSettings:
-    """lowest, least_top : lower end, and smallest upper end, of the colour scale relative to the noise power [1]: noise
-        alone is nearly white, and a residual little above it does not look large.
-    letters : letters of a name that fit beside the map.
-    """
-
-    lowest: float = 0.5
-    least_top: float = 10.0
-    letters: int = 20
-
-
-SETTINGS = MapSettings()
 
 
 def places(found: GapFinding) -> Section:
     """Heat map before and after adding effects, and table of the places before."""
     gap = found.gap
-    pieces: list[Piece] = []
-    if gap.heat is not None:
-        pieces.append(heat_map(gap.heat, bool(gap.effects)))
-    if gap.where:
-        pieces.append(table_of(gap.where, "Places of the gap after re-identification, before any effect is added. "))
-    else:
-        pieces.append(Paragraph(_nowhere(gap)))
-    return Section("Where they disagree", "where", tuple(pieces))
+    return section(
+        "Where they disagree",
+        "where",
+        heat_map(gap.heat, bool(gap.effects)) if gap.heat is not None else None,
+        table_of(gap.where, "Places of the gap after re-identification, before any effect is added. "),
+        None if gap.where else Paragraph(_nowhere(gap)),
+    )
 
 
 def _nowhere(gap: Gap) -> str:
@@ -58,14 +42,15 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     """Residual by channel and frequency of the re-identified and the updated model, on one colour scale."""
     known = np.concatenate([heat.before.ravel(), heat.after.ravel()])
     known = known[np.isfinite(known) & (known > 0)]
-    top = float(10 ** np.ceil(np.log10(known.max(initial=SETTINGS.least_top)) - 1e-9))
+    top = float(10 ** np.ceil(np.log10(known.max(initial=SETTINGS.map_top)) - 1e-9))
     edges, n = heat.bands_Hz, len(heat.columns)
-    x = hertz(float(edges[0]), float(edges[-1]))
     y = Axis("", "linear", (n - 0.5, -0.5), tuple((float(k), _short(name)) for k, name in enumerate(heat.columns)))
 
     def panel(title: str, values: np.ndarray) -> Panel:
         z = np.asarray(values, float).T
-        return Panel(x, y, (), (), title, Heat(edges, z, "residual / noise power [-]", (SETTINGS.lowest, top)))
+        return Panel(
+            hertz(), y, (), (), title, Heat(edges, z, "residual / noise power [-]", (SETTINGS.map_lowest, top))
+        )
 
     panels = [panel("After re-identification", heat.before)]
     if named:
@@ -74,7 +59,7 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
         "heat_map",
         "Power of the residual on held-out data relative to that of the measured noise, by "
         "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.",
-        tuple(panels),
+        panels,
         len(panels),
         max(0.75, min(2.4, 0.085 * n + 0.25)),
     )
@@ -82,7 +67,7 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
 
 def _short(name: str) -> str:
     """A name shortened to fit beside a map."""
-    return name if len(name) <= SETTINGS.letters else f"{name[: SETTINGS.letters - 1]}…"
+    return name if len(name) <= SETTINGS.map_letters else f"{name[: SETTINGS.map_letters - 1]}…"
 
 
 def table_of(places: Sequence[Where], caption: str) -> Table:

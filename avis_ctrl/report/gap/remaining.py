@@ -8,20 +8,21 @@ from avis_ctrl.gap.result import Detectable, Gap, spoken
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.places import table_of
-from avis_ctrl.report.pieces import Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Section, Table, headed, section, table
 from avis_ctrl.study.gap import GapFinding
 
 
 def remaining(found: GapFinding) -> Section:
     """Where the residual of the updated model lies, and the next experiment."""
     gap = found.gap
-    pieces: list[Piece] = [Paragraph(_left(gap))]
-    if gap.remaining:
-        pieces.append(table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "))
-    if gap.detectable:
-        pieces += [Heading("Detection limits"), detectable(gap)]
-    pieces += [Heading("What to measure next"), Paragraph(next_step(found))]
-    return Section("Residual, and what to measure next", "remaining", tuple(pieces))
+    return section(
+        "Residual, and what to measure next",
+        "remaining",
+        Paragraph(_left(gap)),
+        table_of(gap.remaining, "Where the residual of the updated model lies, on held-out data. "),
+        headed("Detection limits", detectable(gap)),
+        headed("What to measure next", Paragraph(next_step(found))),
+    )
 
 
 def detectable(gap: Gap) -> Table:
@@ -48,8 +49,9 @@ def detectable(gap: Gap) -> Table:
 
 
 def _seen(one: Detectable) -> str:
-    unit = "" if one.unit in ("", "1") else f" {words.unit(one.unit)}"
-    return f"{words.number(one.value, 2)}{unit}" if np.isfinite(one.value) else "not detectable"
+    return (
+        f"{words.number(one.value, 2)} {words.unit(one.unit)}".rstrip() if np.isfinite(one.value) else "not detectable"
+    )
 
 
 def _left(gap: Gap) -> str:
@@ -84,7 +86,7 @@ def next_step(found: GapFinding) -> str:
     """The most informative next experiment, or a statement that none is needed or none was found."""
     gap = found.gap
     if gap.next_experiment:
-        return wording.said(gap.next_experiment)
+        return words.sentence(gap.next_experiment)
     if gap.effects and any(one.indistinguishable_from for one in gap.effects):
         return "No further measurement was found that would distinguish the effects that these data confuse."
     if gap.verdict in ("partly explained", "unexplained"):

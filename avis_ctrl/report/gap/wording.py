@@ -86,25 +86,16 @@ def quantity(one: Reported) -> str:
     """A value with its standard deviation and unit."""
     size, std, unit = with_prefix(one.value, one.std, one.unit)
     value, sigma = words.with_std(size, std)
-    unit = "" if unit in ("", "1") else f" {words.unit(unit)}"
+    unit = words.unit(unit)
     if not (np.isfinite(one.std) and one.std > 0):
-        return f"{value}{unit} (no standard deviation)"
-    return f"({value} ± {sigma}){unit}" if unit else f"{value} ± {sigma}"
+        return f"{value} {unit}".rstrip() + " (no standard deviation)"
+    return f"({value} ± {sigma}) {unit}" if unit else f"{value} ± {sigma}"
 
 
 def quantities(parameters: Mapping[str, Reported], most: int | None = None) -> str:
     """Parameters with name, value, standard deviation and unit; at most `most` of them."""
     told = [f"{spoken(name, one.unit)} {quantity(one)}" for name, one in parameters.items()]
     return "; ".join([*told[:most], *([f"and {len(told) - most} more"] if most and len(told) > most else [])])
-
-
-def said(text: str) -> str:
-    """A sentence of the finder as printed: capital first letter, full stop at the end, ± in place of +-."""
-    text = text.replace(" +- ", " ± ").strip()
-    first = text.partition(" ")[0].rstrip(":;,.")
-    # The name of an effect is not capitalised.
-    text = text if "_" in first else text[:1].upper() + text[1:]
-    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
 
 
 def place(one: Where) -> str:

@@ -8,7 +8,7 @@ from avis_ctrl.identification.ekf_result import EkfResult, Innovations, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, level
-from avis_ctrl.report.pieces import Bullets, Heading, Paragraph, Piece, Section, Table, listed, table, yes_or_no
+from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, headed, listed, section, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 
@@ -21,28 +21,24 @@ def ways(found: Identification) -> Section:
     result = found.kalman
     if result is None:
         note = found.kalman_note or "the extended Kalman filter was not run"
-        return Section(TITLE, "ways", (Paragraph(f"{note[:1].upper()}{note[1:]}.", "note"), _sequential(found)))
-    pieces: list[Piece] = [_agreement(found, result), _table(found, result)]
-    pieces += [_figure(found, result, title, index, k) for k, (title, index) in enumerate(kinds(result).items())]
-    pieces += [
+        return section(TITLE, "ways", Paragraph(words.sentence(note), "note"), _sequential(found))
+    return section(
+        TITLE,
+        "ways",
+        (_agreement(found, result), _table(found, result)),
+        [_figure(found, result, title, index, k) for k, (title, index) in enumerate(kinds(result).items())],
         _consistency(found, result),
-        Heading("Influence of the filter's tuning"),
-        Bullets(_hidden(result)),
-        _sequential(found),
-    ]
-    return Section(TITLE, "ways", tuple(pieces))
+        headed("Influence of the filter's tuning", Bullets(_hidden(result)), _sequential(found)),
+    )
 
 
 def _sequential(found: Identification) -> Paragraph:
-    if isinstance(found.start, Halcyonics):
-        return Paragraph(
-            "The sequential fit of Beadle et al. was not run here: it needs the displacement per volt "
-            "from single tests.",
-            "note",
-        )
-    return Paragraph(
-        "The sequential fit of Beadle et al. is for the spring-suspended table; it does not apply to this rig.", "note"
+    why = (
+        "was not run here: it needs the displacement per volt from single tests"
+        if isinstance(found.start, Halcyonics)
+        else "is for the spring-suspended table; it does not apply to this rig"
     )
+    return Paragraph(f"The sequential fit of Beadle et al. {why}.", "note")
 
 
 def _differences(found: Identification, result: EkfResult) -> np.ndarray:
@@ -97,7 +93,7 @@ def _table(found: Identification, result: EkfResult) -> Table:
                 *(first if one.determined else (first[0], "not determined")),
                 *second,
                 f"{apart:+.1f}" if np.isfinite(apart) else "",
-                words.unit(one.unit) if one.unit != "1" else "",
+                words.unit(one.unit),
             )
         )
     return table(
@@ -131,15 +127,15 @@ def _figure(found: Identification, result: EkfResult, title: str, index: list[in
         )
         band = Band(t, curves.lower[:, k], curves.upper[:, k], "± 2 σ", ESTIMATE)
         x = Axis("time in the records [s]", "linear", frame)
-        y = Axis(f"[{words.unit(result.units[k])}]", "linear", ends)
+        y = Axis(f"[{words.unit(result.units[k]) or 1}]", "linear", ends)
         panels.append(Panel(x, y, drawn, (band,), name + ("" if information.known[place] else " *")))
     return Figure(
         f"kalman_{number}",
         f"{title}: the extended Kalman filter's estimate against time, as in "
         "figs. 3.1 to 3.3 of Rademakers; the first second, with the far wider band of the prior, is not "
         "shown. A parameter marked * is known only in combination; its own value depends on the prior.",
-        tuple(panels),
-        min(3, len(panels)),
+        panels,
+        3,
         0.62,
     )
 

@@ -6,13 +6,13 @@ from avis_ctrl.report.identification.comparison import ways
 from avis_ctrl.report.identification.gates import gates
 from avis_ctrl.report.identification.identifiability import identifiability
 from avis_ctrl.report.identification.measurements import measurements
-from avis_ctrl.report.identification.method import method
 from avis_ctrl.report.identification.opening import opening, parameters
 from avis_ctrl.report.identification.responses import responses
-from avis_ctrl.report.identification.uncertainty import uncertainty
 from avis_ctrl.report.identification.validation import validation
-from avis_ctrl.report.pieces import Document, document_of
-from avis_ctrl.report.sections.provenance import provenance_table
+from avis_ctrl.report.method import method
+from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.provenance import document_of
+from avis_ctrl.report.sections.identified import uncertainty
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identified_uncertainty import InDesign
 
@@ -33,10 +33,6 @@ def document(found: Identification, in_design: InDesign | None = None) -> Docume
             ways(found),
             validation(found),
             uncertainty(found, in_design),
-            method(found),
-            provenance_table(
-                found.provenance,
-                "The same measurement, rig, options, seed, library versions and processor give the same figures.",
-            ),
+            method("identification", () if found.campaign_fit.tolerances else ("tolerances",)),
         ),
     )

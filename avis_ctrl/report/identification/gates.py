@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 
 from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Limit, Picture, Series
-from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, log_range, numbered
-from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, table
+from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, numbered, values_of
+from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, section, shown, table
+from avis_ctrl.report.settings import SETTINGS
 
 MARKS: dict[str, Cell] = {
     "ok": Mark("ok", True),
@@ -21,24 +22,11 @@ MARKS: dict[str, Cell] = {
 LIMITS = ("#b3261e", "#7a7a7a", "#d55e00", "#222222")
 
 
-@dataclass(frozen=True)
-class GateFigureSettings:
-    """together : panels per figure; three rows of two fill a page. letters : number of letters that fit side by side
-    under a panel of half the width, at the font size of the legend.
-    """
-
-    together: int = 6
-    letters: int = 36
-
-
-SETTINGS = GateFigureSettings()
-
-
 def gates(findings: Sequence[Finding]) -> Section:
     """Table of all findings, and their pictures."""
     if not findings:
         none = "The gates (automatic checks of the data) need records in the time domain; there were none."
-        return Section("Gates", "gates", (Paragraph(none),))
+        return section("Gates", "gates", Paragraph(none))
     ordered = sorted(findings, key=lambda f: -SEVERITIES.index(f.severity))
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
@@ -57,12 +45,15 @@ def gates(findings: Sequence[Finding]) -> Section:
     for k, (picture, sentences) in enumerate(_pictures(grave)):
         pieces.append(figure_of(f"gate_{k}", " ".join(sentences), [picture]))
     notes = [p for p, _ in _pictures([f for f in ordered if f.severity == "note"])]
-    pieces += _small("gate_notes", "Gates with a note; limits dashed.", notes)
     well = [p for p, _ in _pictures([f for f in ordered if f.severity == "ok"])]
-    small = _small("gate_ok", "Gates without findings; limits dashed.", well)
-    if small:
-        pieces.append(Fold(f"The {len(well)} figures of gates without findings", tuple(small)))
-    return Section("Gates", "gates", tuple(pieces))
+    small = shown(_small("gate_ok", "Gates without findings; limits dashed.", well))
+    fold = Fold(f"The {len(well)} figures of gates without findings", small)
+    return section("Gates", "gates", pieces, _small("gate_notes", "Gates with a note; limits dashed.", notes), fold)
+
+
+def warnings(findings: Sequence[Finding]) -> list[str]:
+    """Names of the gates that gave a warning, each once."""
+    return list(dict.fromkeys(f.gate for f in findings if f.severity in ("warning", "stop")))
 
 
 def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
@@ -92,7 +83,7 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     # Pictures with a curve per channel are kept apart: their legend would list channels that the others lack.
     many = [p for p in pictures if len(p.series) > 2]
     few = [p for p in pictures if len(p.series) <= 2]
-    groups = [of[k : k + SETTINGS.together] for of in (many, few) for k in range(0, len(of), SETTINGS.together)]
+    groups = [of[k : k + SETTINGS.gate_panels] for of in (many, few) for k in range(0, len(of), SETTINGS.gate_panels)]
     return [
         figure_of(
             f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group, 2, 0.75
@@ -105,22 +96,20 @@ def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int
     """Pictures as panels of one figure; a name has the same style in all of them."""
     names = list(dict.fromkeys(s.name for p in pictures for s in p.series))
     limits = list(dict.fromkeys(one.name for p in pictures for one in p.limits))
-    columns = min(columns, len(pictures))
-    letters = SETTINGS.letters * 2 // columns
-    return Figure(name, caption, tuple(panel_of(p, names, limits, letters) for p in pictures), columns, height)
+    letters = SETTINGS.gate_letters * 2 // min(columns, len(pictures))
+    return Figure(name, caption, [_panel(p, names, limits, letters) for p in pictures], columns, height)
 
 
-def panel_of(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int = SETTINGS.letters) -> Panel:
+def _panel(picture: Picture, names: Sequence[str], limits: Sequence[str], letters: int) -> Panel:
     """A picture as panel. names, limits : in the order of their styles. letters : that fit side by side under it."""
-    curves = tuple(_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x))
+    curves = [_curve(one, Style(numbered(names.index(one.name)).colour)) for one in picture.series if len(one.x)]
     if len(picture.series) == 1:  # title and axis label suffice
-        curves = tuple(replace(curve, label="") for curve in curves)
+        curves = [replace(curve, label="") for curve in curves]
     x = Axis(picture.x_label, _scale(picture.x_scale), ticks=_named(picture.x_names, letters))
     panel = Panel(x, Axis(picture.y_label, _scale(picture.y_scale)), curves, (), picture.title)
-    lines = tuple(
-        _line(one, panel, Style(LIMITS[limits.index(one.name) % len(LIMITS)], "dash", 1.3)) for one in picture.limits
-    )
-    return _framed(replace(panel, curves=(*curves, *lines)))
+    colours = [LIMITS[limits.index(one.name) % len(LIMITS)] for one in picture.limits]
+    lines = [_line(one, panel, Style(c, "dash", 1.3)) for one, c in zip(picture.limits, colours, strict=True)]
+    return _framed(replace(panel, curves=[*curves, *lines]))
 
 
 def _named(names: Sequence[str], letters: int) -> tuple[tuple[float, str], ...]:
@@ -149,21 +138,18 @@ def _line(limit: Limit, panel: Panel, style: Style) -> Curve:
     return Curve(x, y, limit.name, style)
 
 
-def _span(panel: Panel, which: str) -> tuple[float, float]:
-    values = np.concatenate([getattr(c, which) for c in panel.curves] or [np.array([0.0, 1.0])])
-    values = values[np.isfinite(values)]
-    if getattr(panel, which).scale == "log":
-        values = values[values > 0]
+def _span(panel: Panel, which: Literal["x", "y"]) -> tuple[float, float]:
+    values = values_of(panel, which)
+    values = values[np.isfinite(values) & ((values > 0) | (getattr(panel, which).scale == "linear"))]
     return (float(values.min()), float(values.max())) if values.size else (0.1, 1.0)
 
 
 def _framed(panel: Panel) -> Panel:
-    """Ranges of the axes: a logarithmic x axis spans the data; on a linear one a few whole numbers become ticks."""
-    x, y = panel.x, replace(panel.y, range=log_range(panel)) if panel.y.scale == "log" else panel.y
-    numbers = np.unique(np.concatenate([c.x for c in panel.curves] or [np.zeros(0)]))
-    if x.scale == "log":
+    """A logarithmic x axis spans the data with a margin; on a linear one a few whole numbers become ticks."""
+    numbers = np.unique(values_of(panel, "x"))
+    if panel.x.scale == "log":
         low, high = _span(panel, "x")
-        x = replace(x, range=(low / 1.1, high * 1.1))
-    elif not x.ticks and 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
-        x = replace(x, ticks=tuple((float(v), f"{v:g}") for v in numbers))
-    return replace(panel, x=x, y=y)
+        return replace(panel, x=replace(panel.x, range=(low / 1.1, high * 1.1)))
+    if not panel.x.ticks and 0 < numbers.size <= 16 and np.all(numbers == np.round(numbers)):
+        return replace(panel, x=replace(panel.x, ticks=tuple((float(v), f"{v:g}") for v in numbers)))
+    return panel

@@ -11,7 +11,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.distortion_lines import DistortionLevels, Kind, distortion_levels
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, section, table
 from avis_ctrl.report.records import records, remarks
 from avis_ctrl.study.identification import Identification
 
@@ -22,13 +22,9 @@ def measurements(found: Identification) -> Section:
     """The records and their use, channels and distortion; or the frequency responses."""
     measured = found.measured
     if isinstance(measured, FrequencyResponse):
-        return Section("Measurements", "measurements", _response(measured))
-    levels = distortion(measured)
-    return Section(
-        "Measurements",
-        "measurements",
-        (_records(found, measured), _channels(found, measured), *([levels] if levels else []), *remarks(measured)),
-    )
+        return section("Measurements", "measurements", _response(measured))
+    tables = (_records(found, measured), _channels(found, measured), distortion(measured))
+    return section("Measurements", "measurements", tables, remarks(measured))
 
 
 def _records(found: Identification, campaign: Campaign) -> Table:

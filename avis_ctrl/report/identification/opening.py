@@ -7,8 +7,9 @@ import numpy as np
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, markers
+from avis_ctrl.report.identification.gates import warnings
 from avis_ctrl.report.identification.validation import errors, modes
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Paragraph, Section, Table, section, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.identification import Identification
 
@@ -18,14 +19,9 @@ TOGETHER = "only in combination"
 def opening(found: Identification) -> Section:
     """Summary page: verdict, measurements, modes, errors, and the next measurement."""
     v = found.validation
-    pieces: list[Piece] = [_sentence(found), _measured(found)]
-    if v.modes:
-        pieces.append(modes(found))
-    if v.held_out:
-        pieces.append(errors(v.held_out[0], v.outputs))
-    if found.advice:
-        pieces.append(Paragraph(f"The next measurement: {found.advice[0]}"))
-    return Section("Summary", "result", tuple(pieces), alone=True)
+    first = [errors(one, v.outputs) for one in v.held_out[:1]]
+    advice = [Paragraph(f"The next measurement: {one}") for one in found.advice[:1]]
+    return section("Summary", "result", _sentence(found), _measured(found), modes(found), first, advice, alone=True)
 
 
 def parameters(found: Identification) -> Section:
@@ -33,8 +29,7 @@ def parameters(found: Identification) -> Section:
     fit = found.campaign_fit
     notes = [*([found.caution] if fit.tolerances else []), *fit.notes]
     said = (Paragraph(words.sentence(note), "note") for note in notes)
-    pieces = (_parameters(found), _changes(found), *tolerances(fit.tolerances), *said)
-    return Section("Parameters", "parameters", pieces)
+    return section("Parameters", "parameters", _parameters(found), _changes(found), tolerances(fit.tolerances), said)
 
 
 def _measured(found: Identification) -> Paragraph:
@@ -57,7 +52,6 @@ def _measured(found: Identification) -> Paragraph:
 def _sentence(found: Identification) -> Paragraph:
     information = found.information
     alone = int(np.count_nonzero(information.known))
-    warned = [f for f in found.findings if f.severity in ("warning", "stop")]
     stops = any(f.severity == "stop" for f in found.findings)
     consistent = all(one.consistent for one in found.validation.held_out)
     count = len(information.names)
@@ -68,9 +62,8 @@ def _sentence(found: Identification) -> Paragraph:
     ]
     if not found.campaign_fit.fit.converged:
         said.append("The fit did not converge.")
-    if warned:
-        names = list(dict.fromkeys(f.gate for f in warned))
-        said.append(f"Gates (data checks) with warnings: {words.joined(names)}.")
+    if warned := warnings(found.findings):
+        said.append(f"Gates (data checks) with warnings: {words.joined(warned)}.")
     elif found.findings:
         said.append("No gate (data check) gave a warning.")
     return Paragraph(" ".join(said), "verdict", consistent and not stops and found.campaign_fit.fit.converged)
@@ -124,5 +117,5 @@ def _changes(found: Identification) -> Figure:
             "value; bars shorter than a marker are hidden by it."
         )
     names = Axis("", "linear", (0.3, n + 0.7), tuple(zip(place.tolist(), information.names, strict=True)))
-    panel = Panel(Axis("change from the start [%]"), names, tuple(curves))
-    return Figure("changes", caption, (panel,), height=max(0.5, 0.07 * n))
+    panel = Panel(Axis("change from the start [%]"), names, curves)
+    return Figure("changes", caption, [panel], height=max(0.5, 0.07 * n))

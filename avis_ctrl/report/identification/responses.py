@@ -2,42 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from avis_ctrl.identification.overlays import ResponseOverlay
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, log_limits, markers
-from avis_ctrl.report.pieces import Paragraph, Piece, Section
-from avis_ctrl.report.response_panels import (
-    MEASURED,
-    SCATTER,
-    Model,
-    difference,
-    drives,
-    frequencies,
-    magnitude,
-    thin,
-    title,
-    unit,
-)
+from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, hertz, log_limits, markers
+from avis_ctrl.report.pieces import Paragraph, Section, section
+from avis_ctrl.report.response_panels import MEASURED, SCATTER, Model, difference, drives, magnitude, thin, title, unit
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.identification import Identification
 
 START, MODEL = Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
-
-
-@dataclass(frozen=True)
-class ResponseSettings:
-    """together : outputs in one figure, which then fills a page. small : maximum number of points of a response in the
-    overview, whose panels are small.
-    """
-
-    together: int = 3
-    small: int = 90
-
-
-SETTINGS = ResponseSettings()
 
 
 def responses(found: Identification) -> Section:
@@ -45,31 +20,25 @@ def responses(found: Identification) -> Section:
     seen = found.validation.overlay
     if seen is None:
         why = "No measured frequency response can be shown; the notes of the section on validation state the reason."
-        return Section("Frequency responses", "responses", (Paragraph(why),))
+        return section("Frequency responses", "responses", Paragraph(why))
     pairs = strongest(seen)
     named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
-    pieces: list[Piece] = [
-        Paragraph(
-            f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within "
-            f"their 95 % confidence region about the identified model; 95 % are expected if they differ from the model "
-            f"by noise only and the estimate has no bias. Shown in full: the strongest input of each output, {named}."
-        )
-    ]
-    if seen.method.startswith("response of the model"):
-        pieces.append(
-            Paragraph(
-                "From these records, any response estimated without a model would be smoothed at the "
-                "resonances. The points are therefore the identified model's response plus the "
-                "residual of the records, regressed on the inputs. A model error that is narrower than "
-                "a window of lines is not visible here, but in the tests of the section on "
-                "validation.",
-                "note",
-            )
-        )
-    groups = [pairs[k : k + SETTINGS.together] for k in range(0, len(pairs), SETTINGS.together)]
-    pieces += [_bode(seen, group, k) for k, group in enumerate(groups)]
-    pieces += [_residual(seen, pairs), _overview(seen)]
-    return Section("Frequency responses", "responses", tuple(pieces))
+    text = (
+        f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within "
+        f"their 95 % confidence region about the identified model; 95 % are expected if they differ from the model "
+        f"by noise only and the estimate has no bias. Shown in full: the strongest input of each output, {named}."
+    )
+    points = (
+        "From these records, any response estimated without a model would be smoothed at the resonances. The points "
+        "are therefore the identified model's response plus the residual of the records, regressed on the inputs. A "
+        "model error that is narrower than a window of lines is not visible here, but in the tests of the section on "
+        "validation."
+    )
+    note = Paragraph(points, "note") if seen.method.startswith("response of the model") else None
+    groups = [pairs[k : k + SETTINGS.response_outputs] for k in range(0, len(pairs), SETTINGS.response_outputs)]
+    large = [_bode(seen, group, k) for k, group in enumerate(groups)]
+    small = (_residual(seen, pairs), _overview(seen))
+    return section("Frequency responses", "responses", Paragraph(text), note, large, small)
 
 
 def strongest(seen: ResponseOverlay) -> list[tuple[int, int]]:
@@ -86,7 +55,7 @@ def _bode(seen: ResponseOverlay, pairs: list[tuple[int, int]], number: int) -> F
         "Magnitude (left) and phase (right): measured (points) with a band of ± 2 "
         "standard deviations, start model (dashed) and identified model (line). A band narrower than a point "
         "is not visible.",
-        tuple(panels),
+        panels,
         2,
         0.85,
     )
@@ -105,7 +74,7 @@ def _phase(seen: ResponseOverlay, i: int, j: int) -> Panel:
         Curve(f, start, "start", START),
     )
     band = Band(f, shown - s, shown + s, "measured, ± 2 σ", SCATTER)
-    return Panel(frequencies(seen), Axis("phase [°]"), curves, (band,), title(seen, i, j))
+    return Panel(hertz(), Axis("phase [°]"), curves, [band], title(seen, i, j))
 
 
 def _models(seen: ResponseOverlay) -> list[Model]:
@@ -117,14 +86,14 @@ def _residual(seen: ResponseOverlay, pairs: list[tuple[int, int]]) -> Figure:
         "residuals",
         "Residual: magnitude of the complex difference between measured response and model. "
         "With noise alone, 86 % of the points are expected below the dotted line.",
-        tuple(difference(seen, i, j, _models(seen)) for i, j in pairs),
+        [difference(seen, i, j, _models(seen)) for i, j in pairs],
         2,
         0.75,
     )
 
 
 def _overview(seen: ResponseOverlay) -> Figure:
-    columns, keep = drives(seen), thin(len(seen.frequency_Hz), SETTINGS.small)
+    columns, keep = drives(seen), thin(len(seen.frequency_Hz), SETTINGS.overview_points)
     f, last = seen.frequency_Hz[keep], len(seen.outputs) - 1
     size = np.abs(np.concatenate([seen.model[:, :, columns], seen.start[:, :, columns]]))
     limits = log_limits(size, 0.7, 1.5, quantile=0.02)
@@ -138,14 +107,14 @@ def _overview(seen: ResponseOverlay) -> Figure:
         for j in columns:
             left, foot = j == columns[0], i == last
             curves = tuple(Curve(f, np.abs(G[keep, i, j]), label, style) for label, (G, style) in styles.items())
-            x = Axis("[Hz]" if foot else "", "log", frequencies(seen).range, silent=not foot)
+            x = Axis("[Hz]" if foot else "", "log", silent=not foot)
             y = Axis(output if left else "", "log", limits, silent=not left)
             panels.append(Panel(x, y, curves, (), "" if i else seen.inputs[j]))
     return Figure(
         "overview",
         f"Magnitude of every pair on the same scales [{unit(seen, columns[0])}]: inputs from "
         "left to right, outputs from top to bottom.",
-        tuple(panels),
+        panels,
         len(columns),
         0.36,
         True,

@@ -2,51 +2,43 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from avis_ctrl.identification.validation import HeldOut
-from avis_ctrl.identification.whiteness import Correlation, Whiteness
+from avis_ctrl.identification.whiteness import Correlation
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, bars, log_limits, markers, numbered, places
-from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed, table, yes_or_no
+from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed, section, shown, table, yes_or_no
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.identification import Identification
 
 BEFORE, AFTER, FLOOR = Style("#e69f00"), Style("#0072b2"), Style("#7a7a7a")
 
 
-@dataclass(frozen=True)
-class ValidationSettings:
-    """drawn : maximum number of held-out records with figures of their own: a long record is split into many pieces."""
-
-    drawn: int = 3
-
-
-SETTINGS = ValidationSettings()
-
-
 def validation(found: Identification) -> Section:
     """Chi-square, errors, whiteness and modes."""
     v = found.validation
-    pieces: list[Piece] = [Paragraph(words.sentence(v.verdict), "verdict", v.passed), _records(found)]
-    drawn = v.held_out[: SETTINGS.drawn]
-    for one in drawn:
-        # The errors of the first record are in the summary.
-        bars_of_errors = [] if one is drawn[0] else [errors(one, v.outputs)]
-        pieces += [_chi_square(one, v.outputs), *bars_of_errors, _nrms(one, v.outputs)]
-        if one.whiteness is not None:
-            pieces.append(_whiteness(one.name, one.whiteness))
-    if len(v.held_out) > len(drawn):
-        left_out = (
-            f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records and pieces; the table "
-            "lists all."
-        )
-        pieces.append(Paragraph(left_out, "note"))
-    if v.modes:
-        pieces += _measured_modes(found)
-    pieces.append(Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))))
-    return Section("Validation", "validation", tuple(pieces))
+    drawn = v.held_out[: SETTINGS.held_out]
+    left_out = (
+        f"Figures are shown for the first {len(drawn)} of {len(v.held_out)} held-out records and pieces; the table "
+        "lists all."
+    )
+    return section(
+        "Validation",
+        "validation",
+        Paragraph(words.sentence(v.verdict), "verdict", v.passed),
+        _records(found),
+        [_record(one, v.outputs, k) for k, one in enumerate(drawn)],
+        Paragraph(left_out, "note") if len(v.held_out) > len(drawn) else None,
+        _measured_modes(found),
+        Bullets(tuple(dict.fromkeys(map(words.sentence, (*v.sentences[1:], *v.notes))))),
+    )
+
+
+def _record(one: HeldOut, outputs: tuple[str, ...], number: int) -> tuple[Piece, ...]:
+    """Figures and table of a held-out record; the errors of the first one are in the summary."""
+    bars_of_errors = errors(one, outputs) if number else None
+    return shown(_chi_square(one, outputs), bars_of_errors, _nrms(one, outputs), _whiteness(one))
 
 
 def _records(found: Identification) -> Table:
@@ -80,7 +72,7 @@ def _chi_square(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     return Figure(
         f"chi_square_{one.name}",
         f"Chi-square per degree of freedom of each output, record {one.name}, with its interval.",
-        (Panel(axis, Axis("chi-square / dof [-]"), curves),),
+        [Panel(axis, Axis("chi-square / dof [-]"), curves)],
         height=0.8,
     )
 
@@ -89,17 +81,17 @@ def errors(one: HeldOut, outputs: tuple[str, ...]) -> Figure:
     """Normalised r.m.s. error of each output as bars."""
     x, axis = places(outputs, "output")
     values = [100 * v for v in (one.nrms_start, one.nrms, one.nrms_floor)]
-    labels, styles = ("start model", "identified model", "noise alone"), (BEFORE, AFTER, FLOOR)
-    curves = tuple(
-        bars(x + 0.26 * (k - 1), v, label, style, 0.24)
-        for k, (v, label, style) in enumerate(zip(values, labels, styles, strict=True))
+    curves = (
+        bars(x - 0.26, values[0], "start model", BEFORE, 0.24),
+        bars(x, values[1], "identified model", AFTER, 0.24),
+        bars(x + 0.26, values[2], "noise alone", FLOOR, 0.24),
     )
     limits = log_limits(np.concatenate(values), 1 / 3, 2, (0.01, 100.0))
     return Figure(
         f"nrms_{one.name}",
         f"Normalised r.m.s. error of each output in the band, record {one.name}: error "
         "divided by output, with the transient of the record removed. Logarithmic.",
-        (Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves),),
+        [Panel(axis, Axis("n.r.m.s. error [%]", "log", limits), curves)],
         height=0.9,
     )
 
@@ -113,7 +105,9 @@ def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
         "in time, identified": one.nrms_time,
         "in time, no filter": one.nrms_time_whole,
     }
-    shown = [len(outputs) * ["none"] if values is None else list(map(_percent, values)) for values in columns.values()]
+    shown = [
+        len(outputs) * ["none"] if values is None else list(map(words.percent, values)) for values in columns.values()
+    ]
     note = f" In time: {one.time_note}." if one.time_note else ""
     return table(
         f"Normalised r.m.s. errors of record {one.name}, on the spectral lines of the band and in time.{note}",
@@ -122,18 +116,15 @@ def _nrms(one: HeldOut, outputs: tuple[str, ...]) -> Table:
     )
 
 
-def _percent(share: float) -> str:
-    return f"{words.number(100 * float(share), 3)} %"
-
-
-def _whiteness(name: str, white: Whiteness) -> Figure:
-    panels = tuple(_correlation(one) for one in white.correlations)
+def _whiteness(one: HeldOut) -> Figure | None:
+    if one.whiteness is None:
+        return None
     return Figure(
-        f"whiteness_{name}",
-        f"Correlations of the residual of each output in record {name}; the largest "
+        f"whiteness_{one.name}",
+        f"Correlations of the residual of each output in record {one.name}; the largest "
         "over the inputs if there are several. With noise alone, at least one of the limits (dashed) is "
         "exceeded in 1 % of all validations.",
-        panels,
+        list(map(_correlation, one.whiteness.correlations)),
         height=0.55,
     )
 
@@ -146,7 +137,7 @@ def _correlation(one: Correlation) -> Panel:
         curves.append(Curve(one.lags, np.max(rows, axis=0), name, Style(numbered(k).colour, "solid", 1.0)))
     curves.append(Curve(one.lags, one.limit.max(axis=0), "limit", Style("#b3261e", "dash", 1.4)))
     y = Axis("correlation [-]", "linear", (0.0, 1.15 * float(max(one.value.max(), one.limit.max()))))
-    return Panel(Axis(f"lag [{one.lag_unit}]"), y, tuple(curves), (), f"{one.what[:1].upper()}{one.what[1:]}")
+    return Panel(Axis(f"lag [{one.lag_unit}]"), y, curves, (), f"{one.what[:1].upper()}{one.what[1:]}")
 
 
 def modes(found: Identification) -> Table:
@@ -164,7 +155,7 @@ def modes(found: Identification) -> Table:
     )
 
 
-def _measured_modes(found: Identification) -> list[Piece]:
+def _measured_modes(found: Identification) -> tuple[Table, Table]:
     """Identified and measured modes with standard deviations."""
     frequencies = listed(
         "Natural frequencies of the identified model beside those measured in the held-out data without the rig's "
@@ -188,7 +179,7 @@ def _measured_modes(found: Identification) -> list[Piece]:
             "difference [σ]": lambda row: _sigma(row.damping_sigma),
         },
     )
-    return [frequencies, dampings]
+    return frequencies, dampings
 
 
 def _pair(value: float, sigma: float) -> str:

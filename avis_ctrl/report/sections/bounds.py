@@ -8,7 +8,8 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
-from avis_ctrl.report.pieces import Mark, Paragraph, Piece, Section, Table, listed, table, yes_or_no
+from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.summary import digits_apart
 
@@ -17,8 +18,7 @@ BoundOf = Callable[[ControllerResult], Bound]
 
 def bounds(result: DesignResult) -> Section:
     """mu of the weighted performance and of stability alone, and the perturbations that attain the lower bounds."""
-    pieces: list[Piece] = [certificate(result), *([Paragraph(result.limits)] if result.limits else [])]
-    pieces += [
+    figures = (
         _figure(
             "mu_performance",
             result,
@@ -37,9 +37,9 @@ def bounds(result: DesignResult) -> Section:
             "Below 1 the loop is stable for every plant of the set. The inverse of the peak of the upper bound is a "
             "guaranteed factor by which the uncertainty may grow.",
         ),
-    ]
-    pieces += [_stability(result), _worst(result)]
-    return Section("Bounds of mu", "bounds", tuple(pieces))
+    )
+    tables = (_stability(result), _worst(result))
+    return section("Bounds of mu", "bounds", certificate(result), Paragraph(result.limits), figures, tables)
 
 
 def certificate(result: DesignResult) -> Paragraph:
@@ -75,11 +75,11 @@ def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what
         curves.append(Curve(f, b.upper_curve[order], c.title, style))
         if c.name != "passive":
             curves.append(Curve(f, b.lower_curve[order], "", Style(style.colour, "dot", 0.9)))
-    curves.append(level(0.01, 1000.0, 1.0, "mu = 1"))
+    curves.append(level(*SETTINGS.loop_Hz, 1.0, "mu = 1"))
     finite = [float(np.max(c.y[np.isfinite(c.y)], initial=1.0)) for c in curves]
     y = Axis(label, "log", (0.05, min(max(finite) * 1.3, 30.0)))
-    panel = Panel(hertz(0.01, 500.0), y, tuple(curves))
-    return Figure(name, f"Upper bounds (thick) and lower bounds (thin, dotted) of {what}. {meaning}", (panel,))
+    caption = f"Upper bounds (thick) and lower bounds (thin, dotted) of {what}. {meaning}"
+    return Figure(name, caption, [Panel(hertz(SETTINGS.loop_Hz), y, curves)])
 
 
 def _stability(result: DesignResult) -> Table:

@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz, numbered
-from avis_ctrl.report.pieces import Piece, Section, Table, listed
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, controller_style, hertz, numbered
+from avis_ctrl.report.pieces import Section, Table, listed, section
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
-
-@dataclass(frozen=True)
-class ControllerSettings:
-    """poles : maximum number of poles in the table, about one page.
-    entries : maximum number of entries of a controller that are distinguishable in one diagram.
-    range_Hz, points : range of the curves [Hz], from the slowest filters to beyond the band of any loop, and number of
-        their points: about a hundred per decade show every resonance.
-    """
-
-    poles: int = 60
-    entries: int = 9
-    range_Hz: tuple[float, float] = (0.01, 500.0)
-    points: int = 500
-
-
-SETTINGS = ControllerSettings()
-HZ = np.geomspace(*SETTINGS.range_Hz, SETTINGS.points)
+HZ = np.geomspace(*SETTINGS.loop_Hz, SETTINGS.loop_points)
 
 
 def controllers(result: DesignResult) -> Section:
     """The section on the controllers."""
     made = [c for c in result.controllers if c.K is not None]
-    pieces: list[Piece] = [
-        _files(result, made),
-        _gains(made),
-        _bode(result),
-        _loops(result, made),
-        _poles(result.controller("mu")),
-    ]
-    return Section("Controllers", "controllers", tuple(pieces))
+    figures = (_gains(made), _bode(result), _loops(result, made))
+    return section("Controllers", "controllers", _files(result, made), figures, _poles(result.controller("mu")))
 
 
 def _system(c: ControllerResult) -> StateSpace:
@@ -82,14 +61,14 @@ def _gains(made: list[ControllerResult]) -> Figure:
     curves = []
     for c in made:
         sigma = np.linalg.svd(_system(c).frequency_response(omega), compute_uv=False)
-        curves.append(Curve(HZ, sigma[:, 0], c.title, controller_style(c.name)))
+        style = controller_style(c.name)
+        curves.append(Curve(HZ, sigma[:, 0], c.title, style))
         if sigma.shape[1] > 1:
-            style = controller_style(c.name)
-            curves.append(Curve(HZ, sigma[:, -1], "", Style(style.colour, style.dash, 0.8)))
+            curves.append(Curve(HZ, sigma[:, -1], "", replace(style, width=0.8)))
     return Figure(
         "controller_gains",
         "Singular values of the controllers, from measured velocity to force: largest (thick) and smallest (thin).",
-        (Panel(hertz(*SETTINGS.range_Hz), Axis("gain [N s/m]", "log"), tuple(curves)),),
+        [Panel(hertz(), Axis("gain [N s/m]", "log"), curves)],
     )
 
 
@@ -98,7 +77,7 @@ def _bode(result: DesignResult) -> Figure:
     K = _system(result.controller("mu"))
     response = K.frequency_response(2 * np.pi * HZ)
     axes = [words.axis(name) for name in result.plant.axes]
-    every = response[0].size <= SETTINGS.entries
+    every = response[0].size <= SETTINGS.controller_entries
     sizes, phases = [], []
     for i, j in np.ndindex(response.shape[1:]):
         if every or i == j:
@@ -111,14 +90,13 @@ def _bode(result: DesignResult) -> Figure:
         coupling = np.where(np.eye(K.noutputs, dtype=bool), 0.0, np.abs(response)).max(axis=(1, 2))
         sizes.append(Curve(HZ, coupling, "largest gain between two axes", STYLES["faint"]))
         what = "the measurement of each axis to the command of the same axis, and the largest gain between two axes"
-    x = hertz(*SETTINGS.range_Hz)
     return Figure(
         "controller_bode",
         f"Bode plot of the mu controller: {what}; the phase is wrapped into ±180 degrees.",
-        (
-            Panel(x, Axis("gain [N s/m]", "log"), tuple(sizes)),
-            Panel(x, Axis("phase [deg]", "linear", (-190.0, 190.0)), tuple(phases)),
-        ),
+        [
+            Panel(hertz(), Axis("gain [N s/m]", "log"), sizes),
+            Panel(hertz(), Axis("phase [deg]", "linear", (-190.0, 190.0)), phases),
+        ],
         2,
     )
 
@@ -128,8 +106,7 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
     omega = 2 * np.pi * HZ
     y, u = list(result.plant.synthesis.y), list(result.plant.synthesis.u)
     G = P.select(y, u).frequency_response(omega)
-    loops, sensitivities = [], []
-    peaks = []
+    loops, sensitivities, peaks = [], [], []
     for c in made:
         L = G @ _system(c).frequency_response(omega)
         S = np.linalg.inv(np.eye(L.shape[1]) - L)
@@ -137,15 +114,14 @@ def _loops(result: DesignResult, made: list[ControllerResult]) -> Figure:
         peaks.append(f"{c.title} {words.decibel(float(size.max()))}")
         loops.append(Curve(HZ, in_dB(np.linalg.norm(L, ord=2, axis=(1, 2))), c.title, controller_style(c.name)))
         sensitivities.append(Curve(HZ, in_dB(size), c.title, controller_style(c.name)))
-    x = hertz(*SETTINGS.range_Hz)
     return Figure(
         "loops",
         "Largest singular value of the open loop G K at the measurement (left) and of the "
         f"sensitivity (I − G K)⁻¹ (right); nominal plant. Peaks of the sensitivity: {'; '.join(peaks)}.",
-        (
-            Panel(x, Axis("open loop [dB]", "linear", (-80.0, _above(loops, 50.0))), tuple(loops)),
-            Panel(x, Axis("sensitivity [dB]", "linear", (-40.0, _above(sensitivities, 20.0))), tuple(sensitivities)),
-        ),
+        [
+            Panel(hertz(), Axis("open loop [dB]", "linear", (-80.0, _above(loops, 50.0))), loops),
+            Panel(hertz(), Axis("sensitivity [dB]", "linear", (-40.0, _above(sensitivities, 20.0))), sensitivities),
+        ],
         2,
     )
 

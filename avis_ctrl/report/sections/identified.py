@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, markers
-from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
+from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, headed, section, table
+from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identified_uncertainty import SETTINGS as COMPARED
 from avis_ctrl.study.identified_uncertainty import InDesign
+from avis_ctrl.study.uncertainty_file import UncertaintyFile
+from avis_ctrl.summary import count_of
 
 
-@dataclass(frozen=True)
-class DirectionSettings:
-    """parameters : maximum number of parameters shown for each direction: they fill a row of the table."""
-
-    parameters: int = 5
-
-
-SETTINGS = DirectionSettings()
-
-
-def identified(result: DesignResult) -> list[Piece]:
+def identified(result: DesignResult) -> tuple[Piece, ...]:
     """Directions, remaining uncertainty, and spread with its weight; empty if the design uses no identification."""
-    found, content = result.plant.identified, result.design.uncertainty.identification
+    found, content, rig = result.plant.identified, result.design.uncertainty.identification, result.plant.rig
     if found is None or content is None:
-        return []
-    pieces: list[Piece] = [Heading("Uncertainty from the identification"), _origin(result, found)]
-    rig = result.plant.rig
-    return [*pieces, *directions(found, rig.nominal, rig.units), spread(found)]
+        return ()
+    shown = (_origin(content, found), directions(found, rig.nominal, rig.units), spread(found))
+    return headed("Uncertainty from the identification", shown)
 
 
-def _origin(result: DesignResult, found: InDesign) -> Paragraph:
-    content = result.design.uncertainty.identification
-    assert content is not None
+def _origin(content: UncertaintyFile, found: InDesign) -> Paragraph:
     d = found.found
     source = content.provenance.get("measurement")
     determined, kept = len(content.direction), len(found.directions)
@@ -72,8 +62,40 @@ def _percent(share: np.ndarray) -> str:
     return f"{words.number(100 * float(np.max(share, initial=0.0)), 2)} %"
 
 
-def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str, str]) -> list[Piece]:
-    """The bounded directions with the parameters that they change most; empty if no direction is bounded."""
+def uncertainty(found: Identification, made: InDesign | None) -> Section:
+    """Section of the report of an identification; None if the uncertainty of a design was not computed."""
+    title, anchor = "Uncertainty for design", "uncertainty"
+    if made is None:
+        missing = (
+            "The uncertainty model for a controller design was not computed with this report; the covariance is in "
+            "result.json."
+        )
+        return section(title, anchor, Paragraph(missing))
+    kept = words.joined([words.axis(name) for name in made.spread.keep])
+    count = len(made.directions)
+    bounded = (
+        f"the joint covariance of the parameters is represented by {count_of(count, 'bounded direction')}"
+        if count
+        else "the parameters are known so precisely that no direction of their covariance needs a bound of its own"
+    )
+    text = (
+        f"For a design of {kept}, {bounded}. The spread of the measured response about the model is represented by "
+        "one filter. The directions and the remaining parameter uncertainty contain the true parameters with a "
+        f"probability of {words.number(100 * made.found.coverage)} %; the bound of the spread is valid with a "
+        f"probability of {words.number(100 * made.confidence)} % at each spectral line. Outside the measured band, "
+        "or if the design file states a larger uncertainty of the drives, the filter is increased accordingly."
+    )
+    rest = (
+        f"The remaining parameter uncertainty changes the response by at most {_percent(made.found.rest)}; the filter "
+        "covers it."
+    )
+    rig = found.rig.parameters()
+    nominal, units = {name: p.value for name, p in rig.items()}, {name: p.unit for name, p in rig.items()}
+    return section(title, anchor, Paragraph(text), directions(made, nominal, units), Paragraph(rest), spread(made))
+
+
+def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str, str]) -> Table:
+    """The bounded directions with the parameters that they change most."""
     rows = []
     for direction, effect in zip(found.directions, found.found.effect, strict=True):
         sizes = sorted(direction.changes, key=lambda one: -abs(one[1] / (nominal.get(one[0]) or 1.0)))
@@ -86,19 +108,13 @@ def directions(found: InDesign, nominal: Mapping[str, float], units: Mapping[str
         left = len(sizes) - SETTINGS.parameters
         more = f" and {left} parameters by less" if left > 0 else ""
         rows.append((direction.name, f"{words.number(100 * float(effect), 2)} %", ", ".join(shown) + more))
-    return (
-        [
-            table(
-                "Directions of correlated parameters: each is one real number between −1 and 1 that changes all of "
-                f"them together; 1 corresponds to {words.number(found.found.box)} standard deviations. The effect is "
-                "the largest relative change of the response at 1.",
-                ("direction", "effect", "change at +1"),
-                rows,
-                "lrl",
-            )
-        ]
-        if rows
-        else []
+    return table(
+        "Directions of correlated parameters: each is one real number between −1 and 1 that changes all of "
+        f"them together; 1 corresponds to {words.number(found.found.box)} standard deviations. The effect is "
+        "the largest relative change of the response at 1.",
+        ("direction", "effect", "change at +1"),
+        rows,
+        "lrl",
     )
 
 
@@ -120,6 +136,6 @@ def spread(found: InDesign) -> Figure:
         "spread",
         "Relative difference between the measured response and the identified model in the kept "
         f"coordinates, largest singular value: {weight.meaning}. {found.assumption}".rstrip(),
-        (Panel(hertz(float(f[0]), float(f[-1])), Axis("relative difference [%]", "log"), curves),),
+        [Panel(hertz(), Axis("relative difference [%]", "log"), curves)],
         height=1.1,
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
@@ -11,10 +9,12 @@ from avis_ctrl.report import words
 from avis_ctrl.report.block_diagram import block_diagram
 from avis_ctrl.report.families import EXTERNAL, Families
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, hertz, level, numbered
-from avis_ctrl.report.pieces import Bullets, Drawing, Heading, Paragraph, Piece, Section, Table, table
+from avis_ctrl.report.pieces import Bullets, Drawing, Paragraph, Section, Table, headed, section, table
 from avis_ctrl.report.sections.identified import identified
-from avis_ctrl.report.sections.transmissibility import asked_dB, upper_bound
-from avis_ctrl.study.design_result import ControllerResult, DesignResult
+from avis_ctrl.report.sections.transmissibility import nominal, target, upper_bound
+from avis_ctrl.report.settings import SETTINGS
+from avis_ctrl.study.analysis import SETTINGS as CURVES
+from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import EFFORT, DesignPlant
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainEquation
@@ -31,19 +31,7 @@ ROLES = {
 }
 KINDS = {"real": "real", "complex": "complex scalar", "full": "complex"}
 
-
-@dataclass(frozen=True)
-class WeightSettings:
-    """range_Hz, points : range of the curves of the weights [Hz], from below the modes of a table to beyond the band of
-    any loop, and number of their points: a hundred per decade show every resonance.
-    """
-
-    range_Hz: tuple[float, float] = (0.1, 500.0)
-    points: int = 400
-
-
-SETTINGS = WeightSettings()
-HZ = np.geomspace(*SETTINGS.range_Hz, SETTINGS.points)
+HZ = np.geomspace(*SETTINGS.weight_Hz, SETTINGS.weight_points)
 
 
 def generalized_plant(result: DesignResult) -> Section:
@@ -64,12 +52,15 @@ def generalized_plant(result: DesignResult) -> Section:
         f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
         f"{words.joined([words.axis(a) for a in plant.axes])}."
     )
-    meanings = Bullets(tuple(f"{n}: {w.meaning}" for n, w in plant.weights.items()))
-    pieces: list[Piece] = [summary, drawing, _signals(plant)]
-    pieces += [Heading("Uncertainty"), _blocks(result), *identified(result)]
-    pieces += [Heading("Weights"), meanings, _transmissibility_weight(result), _effort(result)]
-    pieces += [*_chains(plant), _noise(result), *_compliance(result)]
-    return Section("Generalized plant", "plant", tuple(pieces))
+    meanings = Bullets([f"{n}: {w.meaning}" for n, w in plant.weights.items()])
+    figures = (_transmissibility_weight(result), _effort(result), _chains(plant), _noise(result), _compliance(result))
+    return section(
+        "Generalized plant",
+        "plant",
+        (summary, drawing, _signals(plant)),
+        headed("Uncertainty", _blocks(result), identified(result)),
+        headed("Weights", meanings, figures),
+    )
 
 
 def _signals(plant: DesignPlant) -> Table:
@@ -110,7 +101,7 @@ def _blocks(result: DesignResult) -> Table:
         elif one is not None:
             half = one.half_range(plant.rig.nominal[block.name])
             nominal, unit = plant.rig.nominal[block.name], words.unit(plant.rig.units[block.name])
-            spread = f"{nominal:.6g} ± {half:.4g} {unit}"
+            spread = f"{nominal:.6g} ± {half:.4g} {unit}".rstrip()
             meaning = described.get(block.name, "parameter of the rig")
         else:
             spread = "see the weight" if chain is None else "|W| of the weight"
@@ -125,19 +116,13 @@ def _blocks(result: DesignResult) -> Table:
     )
 
 
-def _mu(result: DesignResult) -> ControllerResult:
-    return result.controller("mu")
-
-
 def _transmissibility_weight(result: DesignResult) -> Figure:
-    mu = _mu(result)
-    omega = mu.transmissibility.omega
-    f = omega / (2 * np.pi)
-    limit = result.plant.weights["transmissibility"].limit(omega)
+    mu = result.controller("mu")
+    limit = result.plant.weights["transmissibility"].limit(mu.transmissibility.omega)
     curves = (
-        Curve(f, asked_dB(result, omega), "target of the synthesis", STYLES["limit"]),
-        Curve(f, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
-        Curve(f, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal", STYLES["mu"]),
+        target(result),
+        nominal(mu, in_dB(limit), "1/|W_T|, the filter", STYLES["filter"]),
+        nominal(mu, in_dB(mu.transmissibility.sigma), "mu synthesis, nominal"),
         upper_bound(mu, "mu synthesis, upper bound over the set"),
     )
     return Figure(
@@ -145,7 +130,7 @@ def _transmissibility_weight(result: DesignResult) -> Figure:
         "The target of the synthesis, its realisation by a rational "
         "filter, and the transmissibility achieved. The loop meets the target where its curves lie below "
         "that of the filter; the upper bound over the set was computed at the marked frequencies.",
-        (Panel(hertz(0.1, 200.0), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves),),
+        [Panel(hertz(CURVES.plot_Hz), Axis("gain [dB]", "linear", (-60.0, 20.0)), curves)],
     )
 
 
@@ -156,35 +141,33 @@ def _effort(result: DesignResult) -> Figure:
         if EFFORT not in plant.weights or not k:  # one limit for all axes is drawn once
             of = "" if EFFORT in plant.weights else f", {shown}"
             curves.append(Curve(HZ, weight.limit(omega), f"1/|W_u|, allowed{of}", STYLES["limit"]))
-        closed = plant.full.closed(_mu(result).K).select([f"effort_{axis}"], plant.floor_velocities)
+        closed = plant.full.closed(result.controller("mu").K).select([f"effort_{axis}"], plant.floor_velocities)
         gain = np.linalg.norm(closed.frequency_response(omega), ord=2, axis=(1, 2)) / weight.magnitude(omega)
         curves.append(Curve(HZ, gain, f"mu synthesis, {shown}", numbered(k)))
     return Figure(
         "weight_effort",
         "Control effort: voltage of the drive that saturates first when a force acts along "
         "the axis, relative to floor velocity, compared with the limit of the weight; nominal plant.",
-        (Panel(hertz(*SETTINGS.range_Hz), Axis("drive voltage / floor velocity [V s/m]", "log"), tuple(curves)),),
+        [Panel(hertz(), Axis("drive voltage / floor velocity [V s/m]", "log"), curves)],
     )
 
 
-def _chains(plant: DesignPlant) -> list[Piece]:
+def _chains(plant: DesignPlant) -> Figure | None:
     chains = {n: w for n, w in plant.weights.items() if isinstance(w, NeglectedDynamics)}
     if not chains:
-        return []
+        return None
     omega = 2 * np.pi * HZ
     curves = [
         Curve(HZ, 100 * w.magnitude(omega), f"{n.removesuffix(' *')}s", numbered(k))
         for k, (n, w) in enumerate(chains.items())
     ]
-    curves.append(level(*SETTINGS.range_Hz, 100.0, "100 %"))
-    return [
-        Figure(
-            "weight_chains",
-            "Neglected dynamics of each channel: relative uncertainty over frequency. Where it "
-            "exceeds 100 %, not even the sign of the channel is known.",
-            (Panel(hertz(*SETTINGS.range_Hz), Axis("uncertainty [%]", "log", (1.0, 1000.0)), tuple(curves)),),
-        )
-    ]
+    curves.append(level(*SETTINGS.weight_Hz, 100.0, "100 %"))
+    return Figure(
+        "weight_chains",
+        "Neglected dynamics of each channel: relative uncertainty over frequency. Where it exceeds 100 %, not even the "
+        "sign of the channel is known.",
+        [Panel(hertz(), Axis("uncertainty [%]", "log", (1.0, 1000.0)), curves)],
+    )
 
 
 def _noise(result: DesignResult) -> Figure:
@@ -196,30 +179,25 @@ def _noise(result: DesignResult) -> Figure:
     curves = (
         Curve(HZ, floor, f"floor ({plant.floor.name})", STYLES["plain"]),
         Curve(HZ, noise, "noise of one sensor", STYLES["hinf"]),
-        level(*SETTINGS.range_Hz, plant.floor_density, "mean floor density, unit of the noise inputs"),
+        level(*SETTINGS.weight_Hz, plant.floor_density, "mean floor density, unit of the noise inputs"),
     )
     return Figure(
         "weight_noise",
         "Spectral density of the floor velocity at the site, in the band of its model, and "
         "of the noise of one sensor with its converter. Where the noise exceeds the floor motion, sensor "
         "noise dominates the signal.",
-        (Panel(hertz(*SETTINGS.range_Hz), Axis("velocity [m/s/√Hz]", "log"), curves),),
+        [Panel(hertz(), Axis("velocity [m/s/√Hz]", "log"), curves)],
     )
 
 
-def _compliance(result: DesignResult) -> list[Piece]:
+def _compliance(result: DesignResult) -> Figure | None:
     if "compliance" not in result.plant.weights:
-        return []
-    omega = _mu(result).transmissibility.omega
-    f = omega / (2 * np.pi)
-    curves = (
-        Curve(f, result.plant.weights["compliance"].limit(omega), "1/|W_c|, allowed", STYLES["limit"]),
-        Curve(f, _mu(result).compliance, "mu synthesis", STYLES["mu"]),
+        return None
+    mu = result.controller("mu")
+    limit = result.plant.weights["compliance"].limit(mu.transmissibility.omega)
+    curves = (nominal(mu, limit, "1/|W_c|, allowed", STYLES["limit"]), nominal(mu, mu.compliance, "mu synthesis"))
+    return Figure(
+        "weight_compliance",
+        "Compliance, compared with the limit of the weight; nominal plant.",
+        [Panel(hertz(), Axis("compliance [m/N]", "log"), curves)],
     )
-    return [
-        Figure(
-            "weight_compliance",
-            "Compliance, compared with the limit of the weight; nominal plant.",
-            (Panel(hertz(0.1, 200.0), Axis("compliance [m/N]", "log"), curves),),
-        )
-    ]

@@ -10,7 +10,7 @@ import numpy as np
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, numbered
-from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, listed, table
+from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, listed, section, table
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
 from avis_ctrl.rigs.rig import Parameter, Rig
@@ -38,9 +38,8 @@ def rig(result: DesignResult) -> Section:
         rig_drawing(one),
         f"Top view and side view of the rig {one.name}",
     )
-    pieces: list[Piece] = [drawing, *_parameters(one), _modes(one), _drives(one), _sensors(one)]
-    pieces += [_electronics(result), *_reduction(result)]
-    return Section("The rig", "rig", tuple(pieces))
+    tables = (_parameters(one), _modes(one), _drives(one), _sensors(one), _electronics(result))
+    return section("The rig", "rig", drawing, tables, _reduction(result))
 
 
 def _parameters(one: Rig) -> list[Piece]:
@@ -255,13 +254,13 @@ def _compared(error: ReductionError) -> Figure:
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
     gain, difference = Axis("gain [dB]", "linear", (-80.0, 40.0)), Axis("difference [dB]", "linear", (-140.0, 20.0))
-    upper = Panel(hertz(), gain, tuple(curves), title="transmissibility along each kept axis")
-    lower = Panel(hertz(), difference, tuple(apart), title="difference, relative to the largest gain")
+    left = Panel(hertz(), gain, curves, (), "transmissibility along each kept axis")
+    right = Panel(hertz(), difference, apart, (), "difference, relative to the largest gain")
     return Figure(
         "reduction",
         "Transmissibility without control, floor to payload along each kept axis: six degrees "
         "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
         "the floor's other axes. Beside it, their difference.",
-        (upper, lower),
+        (left, right),
         2,
     )

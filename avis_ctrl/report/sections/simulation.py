@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import PALETTE, STYLES, Axis, Curve, Figure, Panel, Style, hertz, markers
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, Table, listed, table, yes_or_no
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
 from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
 from avis_ctrl.study.companions import Companions
@@ -17,7 +17,7 @@ def simulation(result: DesignResult) -> Section:
     """The section on the simulation."""
     check = result.simulation
     if not isinstance(check, SimulationCheck):
-        return Section("Simulation of the nonlinear rig", "simulation", (Paragraph("No simulation was run."),))
+        return section("Simulation of the nonlinear rig", "simulation", Paragraph("No simulation was run."))
     passed = sum(p.passed for p in check.plants)
     text = (
         f"{passed} of {len(check.plants)} plants pass. Each is the nonlinear rig with six degrees of freedom, with "
@@ -27,14 +27,16 @@ def simulation(result: DesignResult) -> Section:
         "spectrum agrees with the linear prediction within the limits of random scatter "
         f"(probability of a false alarm in any plant: {words.number(100 * check.false_alarm, 2)} %)."
     )
-    pieces: list[Piece] = [Paragraph(text, "verdict", passed == len(check.plants)), _plants(check)]
-    if result.loop is not None and (result.loop.companions.loops or result.loop.companions.passive):
-        pieces.append(_companions(result.loop.companions))
-    for plant in check.plants[:1]:
-        if plant.spectrum is not None:
-            pieces += [_spectrum(plant.name, plant.spectrum), _ratios(check)]
-    pieces.append(_record(check))
-    return Section("Simulation of the nonlinear rig", "simulation", tuple(pieces))
+    first = check.plants[0]
+    return section(
+        "Simulation of the nonlinear rig",
+        "simulation",
+        Paragraph(text, "verdict", passed == len(check.plants)),
+        _plants(check),
+        _companions(result.loop.companions) if result.loop is not None else None,
+        [_spectrum(first.name, first.spectrum), _ratios(check)] if first.spectrum is not None else None,
+        _record(check),
+    )
 
 
 def _plants(check: SimulationCheck) -> Table:
@@ -96,22 +98,18 @@ def _agreement(p: PlantCheck) -> Mark | str:
 
 def _spectrum(name: str, s: SpectrumAgreement) -> Figure:
     panels = []
-    for k, axis in enumerate(s.axes):
+    for axis, estimated, predicted in zip(s.axes, s.estimated_psd, s.predicted_psd, strict=True):
         curves = (
-            Curve(s.frequency_Hz, np.sqrt(s.estimated_psd[k]), "simulated", Style("#e69f00", "solid", 1.2)),
-            Curve(s.frequency_Hz, np.sqrt(s.predicted_psd[k]), "predicted", STYLES["mu"]),
+            Curve(s.frequency_Hz, np.sqrt(estimated), "simulated", Style("#e69f00", "solid", 1.2)),
+            Curve(s.frequency_Hz, np.sqrt(predicted), "predicted", STYLES["mu"]),
         )
-        panels.append(
-            Panel(
-                hertz(float(s.frequency_Hz[0]), 100.0), Axis("velocity [m/s/√Hz]", "log"), curves, (), words.axis(axis)
-            )
-        )
+        panels.append(Panel(hertz(), Axis("velocity [m/s/√Hz]", "log"), curves, (), words.axis(axis)))
     return Figure(
         "spectrum",
         f'Spectral density of the payload velocity for the plant "{name}": simulated (Welch\'s '
         "method), and predicted by the linear model of the sampled loop.",
-        tuple(panels),
-        min(2, len(panels)),
+        panels,
+        2,
     )
 
 
@@ -123,14 +121,13 @@ def _ratios(check: SimulationCheck) -> Figure:
         curves = [markers(s.midband_Hz, 10 * np.log10(s.ratio[k]), "each plant", each) for s in found]
         for edge in (first.lower, first.upper):
             curves.append(Curve(first.midband_Hz, 10 * np.log10(edge[k]), "limits of random scatter", STYLES["limit"]))
-        y = Axis("simulated over predicted [dB]", "linear")
-        panels.append(Panel(hertz(0.8, 100.0), y, tuple(curves), (), words.axis(axis)))
+        panels.append(Panel(hertz((0.8, 100.0)), Axis("simulated over predicted [dB]"), curves, (), words.axis(axis)))
     return Figure(
         "spectrum_ratio",
         "Power in third octaves, simulated over predicted, for every plant. The dashed "
         "lines are the limits of the first plant; each plant is tested against its own.",
-        tuple(panels),
-        min(2, len(panels)),
+        panels,
+        2,
     )
 
 
@@ -141,10 +138,9 @@ def _record(check: SimulationCheck) -> Figure:
         Curve(time, 1e6 * first.velocity(axis)[:5000], words.axis(axis), Style(PALETTE[k % 3], "solid", 0.9))
         for k, axis in enumerate(first.loop.axes)
     ]
-    span = (float(time[0]), float(time[-1]))
     return Figure(
         "record",
         f'The first seconds of the simulation of the plant "{check.plants[0].name}": payload '
         "velocity, rotations at the edge.",
-        (Panel(Axis("time [s]", "linear", span), Axis("velocity [µm/s]"), tuple(motion)),),
+        [Panel(Axis("time [s]", "linear", (time[0], time[-1])), Axis("velocity [µm/s]"), motion)],
     )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, controller_style, hertz
-from avis_ctrl.report.pieces import Paragraph, Section, Table, table
-from avis_ctrl.report.sections.transmissibility import left_out
+from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, controller_style, hertz
+from avis_ctrl.report.pieces import Paragraph, Section, Table, section, table
+from avis_ctrl.report.sections.transmissibility import left_out, nominal
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
@@ -15,15 +15,12 @@ from avis_ctrl.study.design_result import ControllerResult, DesignResult
 def site(result: DesignResult) -> Section:
     """The section on the site."""
     floor = result.plant.floor
-    text = Paragraph(
+    text = (
         f"The floor moves independently along each kept axis, each time with the spectrum {floor.name} "
         f"({floor.source}); sensor noise is added. Nominal plant, linear model."
     )
-    return Section(
-        "Motion at the site",
-        "site",
-        (text, _third_octaves(result), _motion(result), _volts(result), _compliance(result)),
-    )
+    shown = (_third_octaves(result), _motion(result), _volts(result), _compliance(result))
+    return section("Motion at the site", "site", Paragraph(text), shown)
 
 
 def _settled(result: DesignResult) -> list[ControllerResult]:
@@ -43,13 +40,12 @@ def _third_octaves(result: DesignResult) -> Figure:
         payload = 1e6 * one.site.payload_third_octaves.max(axis=1)
         curves.append(Curve(bands, payload, one.title, controller_style(one.name)))
     ratings = "; ".join(f"{c.title} {c.site.rating or 'none'}" for c in _settled(result))
-    panel = Panel(hertz(1.0, 100.0), Axis("velocity [µm/s r.m.s.]", "log"), tuple(curves))
     return Figure(
         "third_octaves",
         "Velocity in third octaves: the site's floor, and the worst axis of the payload, "
         "compared with the generic vibration criteria. Criterion met: floor "
         f"{first.floor_rating or 'none'}; {ratings}." + left_out(result),
-        (panel,),
+        [Panel(hertz(), Axis("velocity [µm/s r.m.s.]", "log"), curves)],
     )
 
 
@@ -82,13 +78,10 @@ def _volts(result: DesignResult) -> Table:
 
 
 def _compliance(result: DesignResult) -> Figure:
-    curves = []
-    for c in _settled(result):
-        style: Style = controller_style(c.name)
-        curves.append(Curve(c.transmissibility.omega / (2 * np.pi), 1e6 * c.compliance, c.title, style))
+    curves = [nominal(c, 1e6 * c.compliance) for c in _settled(result)]
     return Figure(
         "compliance",
         "Compliance: displacement of the payload relative to the floor per force on the "
         "payload, largest singular value, floor at rest; nominal plant." + left_out(result),
-        (Panel(hertz(0.1, 200.0), Axis("compliance [µm/N]", "log"), tuple(curves)),),
+        [Panel(hertz(), Axis("compliance [µm/N]", "log"), curves)],
     )

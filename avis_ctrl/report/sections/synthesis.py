@@ -6,7 +6,7 @@ import numpy as np
 
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, log_limits, numbered
-from avis_ctrl.report.pieces import Section, listed
+from avis_ctrl.report.pieces import Section, listed, section
 from avis_ctrl.study.design_result import DesignResult
 
 
@@ -64,4 +64,4 @@ def synthesis(result: DesignResult) -> Section:
         "gamma is the norm of the scaled loop, an upper bound of mu with every block taken as complex."
     )
     course = Figure("dk_history", caption, (values, orders), 2)
-    return Section("D-K iteration", "synthesis", (iterations, course))
+    return section("D-K iteration", "synthesis", iterations, course)

@@ -3,40 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Heading, Paragraph, Piece, table
+from avis_ctrl.report.pieces import Paragraph, Piece, headed, table
+from avis_ctrl.report.settings import SETTINGS
 
 
-@dataclass(frozen=True)
-class ToleranceSettings:
-    """rows : maximum number of rows, which fill a third of a page; the JSON file has all. far : change in tolerances
-    beyond which a value counts as far off [1]: one in 400 if the tolerances are right."""
-
-    rows: int = 10
-    far: float = 3.0
-
-
-SETTINGS = ToleranceSettings()
-
-
-def tolerances(found: Sequence[Tolerance]) -> list[Piece]:
+def tolerances(found: Sequence[Tolerance]) -> tuple[Piece, ...]:
     """Changes of the values: a summary of all, and a table of the largest."""
     if not found:
-        return []
+        return ()
     moved = np.array([one.moved for one in found])
     far = int(np.sum(np.abs(moved) > SETTINGS.far))
     rms = words.number(float(np.sqrt(np.mean(moved**2))), 2)
     rows = [
         (one.parameter, *words.with_std(one.value, one.std), words.unit(one.unit), f"{one.moved:+.2f}")
-        for one in found[: SETTINGS.rows]
+        for one in found[: SETTINGS.tolerances]
     ]
-    return [
-        Heading("Tolerances"),
+    return headed(
+        "Tolerances",
         Paragraph(
             f"{len(found)} values of the rig file have a tolerance. The fit moved them by {rms} tolerances "
             f"(r.m.s.), {far or 'none'} of them by more than {SETTINGS.far:g} tolerances."
@@ -48,4 +36,4 @@ def tolerances(found: Sequence[Tolerance]) -> list[Piece]:
             rows,
             "lrrlr",
         ),
-    ]
+    )

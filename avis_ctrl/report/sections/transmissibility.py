@@ -2,34 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
-from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, controller_style, hertz
-from avis_ctrl.report.pieces import Section, Table, listed
+from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, Style, controller_style, hertz
+from avis_ctrl.report.pieces import Section, Table, listed, section
+from avis_ctrl.report.settings import SETTINGS
+from avis_ctrl.study.analysis import SETTINGS as CURVES
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
-
-
-@dataclass(frozen=True)
-class GainSettings:
-    """range_dB : range of the gain axis [dB]: down to isolation by a factor of 1000, up to the peak of a table with
-    little damping.
-    """
-
-    range_dB: tuple[float, float] = (-60.0, 40.0)
-
-
-SETTINGS = GainSettings()
 
 
 def transmissibility(result: DesignResult) -> Section:
     """The figures of transmissibility."""
-    figures = (_nominal(result), _uncertain(result), _by_axis(result), _six_dof(result))
-    tables = (_against_skyhook(result),) if result.by_axis else ()
-    return Section("Transmissibility", "transmissibility", (*figures[:3], *tables, *figures[3:]))
+    figures = (_nominal(result), _uncertain(result), _by_axis(result))
+    return section("Transmissibility", "transmissibility", figures, _against_skyhook(result), _six_dof(result))
 
 
 def _against_skyhook(result: DesignResult) -> Table:
@@ -49,27 +38,28 @@ def _against_skyhook(result: DesignResult) -> Table:
     )
 
 
-def asked_dB(result: DesignResult, omega: np.ndarray) -> np.ndarray:
-    """Target of the synthesis [dB], with its steps."""
-    limits = result.design.transmissibility
-    f = omega / (2 * np.pi)
-    inside = (f >= limits.band_Hz[0]) & (f <= limits.band_Hz[1])
-    return np.where(inside, limits.band_dB, limits.peak_dB)
-
-
 def left_out(result: DesignResult) -> str:
     """Sentence on the controllers that a figure of the nominal loop omits, because their loop is unstable."""
     unstable = [c.title for c in result.controllers if not c.stable]
     return f" Not shown, because the nominal loop is unstable: {words.joined(unstable)}." if unstable else ""
 
 
-def _limit(result: DesignResult) -> Curve:
-    omega = 2 * np.pi * np.geomspace(0.1, 200.0, 2000)
-    return Curve(omega / (2 * np.pi), asked_dB(result, omega), "target of the synthesis", STYLES["limit"])
+def target(result: DesignResult) -> Curve:
+    """Target of the synthesis [dB], with its steps."""
+    asked = result.design.transmissibility
+    (low, high), (first, last) = asked.band_Hz, CURVES.plot_Hz
+    f = np.array([first, low, low, high, high, last])
+    levels = np.repeat([asked.peak_dB, asked.band_dB, asked.peak_dB], 2)
+    return Curve(f, levels, "target of the synthesis", STYLES["limit"])
+
+
+def nominal(c: ControllerResult, values: np.ndarray, label: str = "", style: Style | None = None) -> Curve:
+    """A curve over the frequencies of the nominal loop, by default with title and style of the controller."""
+    return Curve(_hz(c), values, label or c.title, style or controller_style(c.name))
 
 
 def _sigma(c: ControllerResult) -> Curve:
-    return Curve(_hz(c), in_dB(c.transmissibility.sigma), c.title, controller_style(c.name))
+    return nominal(c, in_dB(c.transmissibility.sigma))
 
 
 def upper_bound(c: ControllerResult, label: str) -> Curve:
@@ -83,10 +73,8 @@ def _hz(c: ControllerResult) -> np.ndarray:
     return c.transmissibility.omega / (2 * np.pi)
 
 
-def _panel(
-    curves: list[Curve], bands: list[Band], title: str, ranged: tuple[float, float] = SETTINGS.range_dB
-) -> Panel:
-    return Panel(hertz(0.1, 200.0), Axis("largest gain [dB]", "linear", ranged), tuple(curves), tuple(bands), title)
+def _panel(curves: list[Curve], bands: Sequence[Band] = (), title: str = "", label: str = "largest gain [dB]") -> Panel:
+    return Panel(hertz(CURVES.plot_Hz), Axis(label, "linear", SETTINGS.gain_dB), curves, bands, title)
 
 
 def summary_figure(result: DesignResult) -> Figure:
@@ -95,13 +83,13 @@ def summary_figure(result: DesignResult) -> Figure:
     curves = [
         *(_sigma(c) for c in (passive, mu) if c.stable),
         upper_bound(mu, "mu synthesis, worst case of the set"),
-        _limit(result),
+        target(result),
     ]
     return Figure(
         "summary",
         "Transmissibility from floor to payload, largest gain: without control, with the mu "
         "controller on the nominal plant, and its upper bound over every plant of the uncertainty set.",
-        (_panel(curves, [], ""),),
+        [_panel(curves)],
     )
 
 
@@ -113,58 +101,43 @@ def _nominal(result: DesignResult) -> Figure:
         f"{words.decibel(mu.peak_transmissibility)}."
     )
     curves = [_sigma(c) for c in result.controllers if c.stable]
-    return Figure("transmissibility_nominal", caption + left_out(result), (_panel([*curves, _limit(result)], [], ""),))
-
-
-def _with_bounds(result: DesignResult) -> list[ControllerResult]:
-    """The mu controller, and the tuned controllers "skyhook" and "loops" if they were computed."""
-    return [c for name in ("mu", "skyhook", "loops") for c in result.controllers if c.name == name]
+    return Figure("transmissibility_nominal", caption + left_out(result), [_panel([*curves, target(result)])])
 
 
 def _uncertain(result: DesignResult) -> Figure:
-    panels = []
-    for c in _with_bounds(result):
-        T = c.transmissibility
-        style = controller_style(c.name)
-        worst = upper_bound(c, "upper bound over the whole set")
-        band = Band(_hz(c), in_dB(T.low), in_dB(T.high), f"{c.title}: range over sampled plants", style)
-        panels.append(_panel([_sigma(c), worst, _limit(result)], [band], c.title))
-    return Figure("transmissibility_uncertain", _spread_words(result), tuple(panels), len(panels))
-
-
-def _spread_words(result: DesignResult) -> str:
-    parts = []
-    for c in _with_bounds(result):
-        parts.append(
-            f"{c.title}: sampled plants peak at {words.decibel(float(np.max(c.transmissibility.high)))}, the "
+    """The mu controller, and the tuned controllers "skyhook" and "loops" if they were computed."""
+    panels, peaks = [], []
+    for c in (c for name in ("mu", "skyhook", "loops") for c in result.controllers if c.name == name):
+        T, worst = c.transmissibility, upper_bound(c, "upper bound over the whole set")
+        label = f"{c.title}: range over sampled plants"
+        band = Band(_hz(c), in_dB(T.low), in_dB(T.high), label, controller_style(c.name))
+        panels.append(_panel([_sigma(c), worst, target(result)], [band], c.title))
+        peaks.append(
+            f"{c.title}: sampled plants peak at {words.decibel(float(np.max(T.high)))}, the "
             f"bound at {words.decibel(c.worst_peak.upper)}"
         )
-    return (
+    caption = (
         "Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
         f"and the upper bound that no plant of the set exceeds at the marked frequencies. The lines between the "
-        f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(parts)}."
+        f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(peaks)}."
     )
+    return Figure("transmissibility_uncertain", caption, panels, len(panels))
 
 
 def _by_axis(result: DesignResult) -> Figure:
-    panels = []
-    for k, axis in enumerate(result.plant.axes):
-        curves = [
-            Curve(_hz(c), in_dB(c.transmissibility.nominal[:, k, k]), c.title, controller_style(c.name))
-            for c in result.controllers
-            if c.stable
-        ]
-        panels.append(
-            Panel(
-                hertz(0.1, 200.0), Axis("gain [dB]", "linear", SETTINGS.range_dB), tuple(curves), (), words.axis(axis)
-            )
+    settled = [c for c in result.controllers if c.stable]
+    panels = [
+        _panel(
+            [nominal(c, in_dB(c.transmissibility.nominal[:, k, k])) for c in settled], (), words.axis(axis), "gain [dB]"
         )
+        for k, axis in enumerate(result.plant.axes)
+    ]
     return Figure(
         "transmissibility_axes",
         "Each axis alone, nominal plant: payload velocity over floor velocity along "
         "the same axis, without the coupling between axes." + left_out(result),
-        tuple(panels),
-        min(2, len(panels)),
+        panels,
+        2,
     )
 
 
@@ -182,4 +155,4 @@ def _six_dof(result: DesignResult) -> Figure:
         "from that of the design model. The third line shows how floor motion along the other coordinates "
         "reaches the kept axes."
     )
-    return Figure("transmissibility_six_dof", caption, (_panel(curves, [], ""),))
+    return Figure("transmissibility_six_dof", caption, [_panel(curves)])

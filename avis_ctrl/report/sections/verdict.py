@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Piece, Section, listed, table, yes_or_no
+from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, listed, section, table, yes_or_no
 from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
@@ -32,16 +32,13 @@ def verdict(result: DesignResult) -> Section:
         },
         "lcrr",
     )
-    task: list[Piece] = [_sentence(result), _asked(result), *([judged] if result.requirements else [])]
-    return Section("Summary", "verdict", (*task, certificate(result), summary_figure(result)), alone=True)
-
-
-def _sentence(result: DesignResult) -> Paragraph:
-    good = None if not result.requirements else result.stable and all(r.met for r in result.requirements)
-    if not result.stable:
-        return Paragraph(first_sentence(result), "verdict", False)
-    said = f"{first_sentence(result)} {_achieved(result)}"
-    return Paragraph(said, "verdict", good)
+    achieved = f" {_achieved(result)}" if result.stable else ""
+    good = result.stable and all(r.met for r in result.requirements)
+    first = Paragraph(
+        first_sentence(result) + achieved, "verdict", None if result.stable and not result.requirements else good
+    )
+    shown = (first, _asked(result), judged, certificate(result), summary_figure(result))
+    return section("Summary", "verdict", *shown, alone=True)
 
 
 def _asked(result: DesignResult) -> Paragraph:
@@ -120,17 +117,12 @@ def comparison(result: DesignResult) -> Section:
         ("", *(c.title for c in controllers)),
         [(name, *(value(c) for c in controllers)) for name, value in rows],
     )
-    notes = [f"{c.title}: {'; '.join(c.notes)}" for c in controllers if c.notes]
+    noted = [(r.name, r.note) for r in result.requirements if r.note]
+    requirements = table("Notes to the requirements of the summary.", ("requirement", "note"), noted, "ll")
+    notes = [*result.notes, *(f"{c.title}: {'; '.join(c.notes)}" for c in controllers if c.notes)]
     notes += [f"The controller {c.title!r} is not in the table: {c.reason}" for c in result.failed]
-    pieces = (compared, *_remarks(result), *(Paragraph(note, "note") for note in notes))
-    return Section("Controllers compared", "comparison", pieces)
-
-
-def _remarks(result: DesignResult) -> list[Piece]:
-    """Notes on the requirements and on the result."""
-    rows = [(r.name, r.note) for r in result.requirements if r.note]
-    told: list[Piece] = [table("Notes to the requirements of the summary.", ("requirement", "note"), rows, "ll")]
-    return [*(told if rows else []), *(Paragraph(note, "note") for note in result.notes)]
+    said = (Paragraph(note, "note") for note in notes)
+    return section("Controllers compared", "comparison", compared, requirements, said)
 
 
 def _settled(c: ControllerResult, text: str) -> str:
