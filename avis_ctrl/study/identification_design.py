@@ -22,6 +22,7 @@ from avis_ctrl.rigs.logical_axes import drivable, sensed
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
 from avis_ctrl.study.design_file import ChainUncertainty, Design, design_from_table, read_design
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE, UNCERTAINTY_FILE
 from avis_ctrl.study.identified_uncertainty import InDesign, in_design
@@ -45,7 +46,7 @@ DRIVES = DriveUncertaintySettings()
 # Designs for z and phi_x by kind of rig, as in designs/*.toml; rig and uncertainty are filled in.
 _COMMON: dict[str, Any] = {"keep": ["z", "phi_x"], "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1}}
 _AVIS: dict[str, Any] = _COMMON | {
-    "loop": {"amplifier_corner_Hz": 300.0},
+    "loop": {"amplifier_corner_Hz": CAMPAIGN.amplifier_corner_Hz},
     "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 80.0, "high_percent": 400.0}},
     "transmissibility": {
         "peak_dB": 3.5,
@@ -65,7 +66,7 @@ _AVIS: dict[str, Any] = _COMMON | {
     ],
 }
 _HALCYONICS: dict[str, Any] = _COMMON | {
-    "loop": {"amplifier_corner_Hz": 300.0, "integrator_corner_Hz": 0.1},
+    "loop": {"amplifier_corner_Hz": CAMPAIGN.amplifier_corner_Hz, "integrator_corner_Hz": 0.1},
     "uncertainty": {"actuator_chains": {"low_percent": 10.0, "crossover_Hz": 150.0, "high_percent": 400.0}},
     "transmissibility": {
         "peak_dB": 3.5,
