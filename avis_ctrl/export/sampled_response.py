@@ -39,6 +39,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import Filter, conditioning
 from avis_ctrl.robust.mu_peak import MuPeak, stability_bound, worst_case_gain
 from avis_ctrl.robust.mu_upper import skewed_upper_bound
+from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.workers import each
 from avis_ctrl.uncertainty.blocks import BlockStructure
@@ -95,7 +96,7 @@ class SampledAxes:
                 value=keep,
             )
         kept = [COORDINATES.index(name) for name in keep]
-        lever = np.array([rig.edge_m if name.startswith("phi") else 1.0 for name in keep])
+        lever = lever_arms(rig, keep)
         names, H = rig.sensor_rows()
         found = actuator_axes(rig, keep)
         if controller.system.inputs != tuple(names) or controller.system.outputs != tuple(found.actuators):
@@ -139,11 +140,11 @@ class SampledAxes:
         T = self.period_s
         return np.sinc(omega * T / (2 * np.pi)) * np.exp(-1j * omega * T * (0.5 + self.controller.delay_samples))
 
-    def pade(self, omega: np.ndarray) -> np.ndarray:
-        """(n,) delay of the design model, which the plant already contains."""
+    @property
+    def pade(self) -> StateSpace:
+        """Delay of the design model, which the plant already contains."""
         rig = self.folder.rig
-        system = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
-        return system.frequency_response(omega)[:, 0, 0]
+        return pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
 
     @cached_property
     def _filters(self) -> list[StateSpace | None]:
@@ -169,7 +170,8 @@ class SampledAxes:
 
     def response(self, omega: np.ndarray) -> np.ndarray:
         """(n_omega, n, n) R without the design model's delay; it takes the place of the design's controller."""
-        return (self.hold(omega) / self.pade(omega))[:, None, None] * (self.forces @ self.volts(omega))
+        delay = self.pade.frequency_response(omega)[:, 0, 0]
+        return (self.hold(omega) / delay)[:, None, None] * (self.forces @ self.volts(omega))
 
     def gain_at_rest(self) -> float:
         """Largest gain from the seen velocities of the axes to their forces far below every pole [N s/m]."""
@@ -184,20 +186,13 @@ class SampledAxes:
         K : continuous, from seen velocities to forces [N s/m]; the delay tau is that of the design model.
         least : gain [N s/m] below which the error is measured absolutely.
         """
-        T, rig, own = self.period_s, self.folder.rig, self.controller.system
-        design_delay = pade_delay(rig.loop_delay_s + 0.5 / rig.sample_rate_Hz, self.folder.design.loop.pade_order)
-        delay = design_delay.poles().tolist()
+        T, own, delay = self.period_s, self.controller.system, self.pade.poles().tolist()
         # The inverse of the all-pass of the design's delay; it is 1 at zero frequency.
         no_pade = roots_jet(delay, [-one for one in delay], (-1.0) ** len(delay), centre, half)
         channel = self._channel
         unfiltered = roots_jet(channel.poles, channel.zeros, 1 / channel.leading, centre, half)
-        code = StateSpace(
-            own.A,
-            own.B @ (self.gains_V[:, None] * self.rows),
-            self.forces @ own.C,
-            self.forces @ own.D @ (self.gains_V[:, None] * self.rows),
-            T,
-        )
+        volts = self.gains_V[:, None] * self.rows
+        code = StateSpace(own.A, own.B @ volts, self.forces @ own.C, self.forces @ own.D @ volts, T)
         held = sinc_jet(T, centre) * (delay_jet(T * (0.5 + self.controller.delay_samples), centre) * no_pade)
         R = held * (unfiltered * system_jet(code, centre, half))
         # The part that rounding adds beside the axes is about 1e-7 of R and as smooth: doubled for the interval.
@@ -224,30 +219,19 @@ class SampledAxes:
         With exact decoding and allocation it would be zero; rounded coefficients make it about 1e-7 of the controller.
         """
         plant, volts = self.folder.plant, self.volts(omega)
-        hold = np.abs(self.hold(omega))
-        found = np.zeros(omega.size)
         allocation = np.zeros((self.forces.shape[1], len(plant.axes)))
         allocation[[self.controller.system.outputs.index(name) for name in plant.actuators]] = plant.allocation
-        if (weight := plant.weights.get("actuator chain *")) is not None:
-            beside = volts - allocation @ (self.forces @ volts)
-            found += (
-                weight.magnitude(omega)
-                * hold
-                * np.linalg.norm(self.forces, 2)
-                * np.linalg.norm(beside, ord=2, axis=(1, 2))
-            )
-        if (weight := plant.weights.get("sensor chain *")) is not None:
-            by_sensor = self.forces @ (
-                self.controller.system.frequency_response(omega) * self.sensor_volts(omega)[:, None, :]
-            )
-            beside = by_sensor - by_sensor @ self.rows @ plant.decoding
-            found += (
-                weight.magnitude(omega)
-                * hold
-                * np.linalg.norm(self.rows, 2)
-                * np.linalg.norm(beside, ord=2, axis=(1, 2))
-            )
-        return found
+        by_sensor = self.forces @ (
+            self.controller.system.frequency_response(omega) * self.sensor_volts(omega)[:, None, :]
+        )
+        found = np.zeros(omega.size)
+        for chains, beside, size in (
+            ("actuator chain *", volts - allocation @ (self.forces @ volts), np.linalg.norm(self.forces, 2)),
+            ("sensor chain *", by_sensor - by_sensor @ self.rows @ plant.decoding, np.linalg.norm(self.rows, 2)),
+        ):
+            if (weight := plant.weights.get(chains)) is not None:
+                found += weight.magnitude(omega) * size * np.linalg.norm(beside, ord=2, axis=(1, 2))
+        return found * np.abs(self.hold(omega))
 
     # -- images of the sample rate -------------------------------------------------------
     @property

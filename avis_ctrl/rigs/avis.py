@@ -9,23 +9,16 @@ import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
+from pydantic import AfterValidator, Field, ValidationInfo
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.instruments import (
-    Drive,
-    FloorSensor,
-    GeophoneAt,
-    Instrument,
-    Sensor,
-    Tolerances,
-    Triple,
-    triple,
-    with_gain,
-)
+from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics, Geophones
+from avis_ctrl.rigs.file_errors import Values
+from avis_ctrl.rigs.instruments import Drive, FloorSensor, GeophoneAt, Instrument, Tolerances, Triple, triple
+from avis_ctrl.rigs.key_types import DampingVector, Point, PositiveVector
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map
@@ -42,8 +35,12 @@ _UNITS = {"k": "N/m", "c": "N s/m", "p": "m"}
 _WORDS = {"k": "stiffness", "c": "damping", "p": "position of the attachment"}
 
 
+def _from_attachment(point: tuple[float, ...], info: ValidationInfo) -> tuple[float, ...]:
+    return triple(np.subtract(point, info.data.get("position", point)))
+
+
 @dataclass(frozen=True)
-class Isolator:
+class Isolator(Values):
     """Air mount: spring and damper along each earth axis (eqs. 2.15-2.16).
 
     position [m] : attachment p_i on the payload, relative to its geometric centre.
@@ -52,10 +49,10 @@ class Isolator:
         source (Table 3.1).
     """
 
-    position: tuple[float, ...]
-    stiffness: tuple[float, ...]
-    damping: tuple[float, ...]
-    chassis_offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    position: Annotated[Point, Field(alias="position_m")]
+    stiffness: Annotated[PositiveVector, Field(alias="stiffness_N_per_m")]
+    damping: Annotated[DampingVector, Field(alias="damping_Ns_per_m")]
+    chassis_offset: Annotated[Point, Field(alias="chassis_point_m"), AfterValidator(_from_attachment)] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,6 @@ class AvisTable(Rig):
     geophones: Geophones | None
     acquisition: Acquisition
     ambient: Ambient | None = None
-    accelerometers: Accelerometers | None = None
     drives: tuple[Drive, ...] = ()
     instruments: tuple[Instrument, ...] = ()
     floor_sensors: tuple[FloorSensor, ...] = ()
@@ -126,17 +122,6 @@ class AvisTable(Rig):
     def with_drives_limited(self, limit_V: float) -> AvisTable:
         drives = tuple(replace(one, limit_V=min(one.limit_V, limit_V)) if one.limit_V else one for one in self.drives)
         return replace(self, limit_V=min(self.limit_V, limit_V), drives=drives)
-
-    def with_loop_delay(self, delay_s: float) -> AvisTable:
-        return replace(self, acquisition=replace(self.acquisition, loop_delay_s=delay_s))
-
-    @property
-    def sample_rate_Hz(self) -> float:
-        return self.acquisition.sample_rate_Hz
-
-    @property
-    def loop_delay_s(self) -> float:
-        return self.acquisition.loop_delay_s
 
     def inertia_matrix(self) -> np.ndarray:
         """(3, 3) about the centre of mass."""
@@ -240,7 +225,7 @@ class AvisTable(Rig):
     def _nearest_mounts(self) -> dict[str, tuple[tuple[str, float], bool]]:
         at = np.array([one.position for one in self.isolators])
         found: dict[str, tuple[tuple[str, float], bool]] = {}
-        for one in (*self.all_drives, *self._attached(), *self.instruments):
+        for one in (*self.all_drives, *self.all_instruments):
             away, k = np.linalg.norm(at - one.position, axis=1), int(np.argmax(np.abs(one.direction)))
             nearest, along = int(np.argmin(away)), one.direction[k]
             inside = away[nearest] < IN_MOUNT_m and abs(along) > np.cos(IN_MOUNT_rad)
@@ -249,9 +234,7 @@ class AvisTable(Rig):
 
     def with_channels_apart(self) -> AvisTable:
         """The same table with motors and geophones at positions that do not move with the isolators."""
-        return replace(
-            self, motors=(), drives=self.all_drives, geophones=None, instruments=(*self._attached(), *self.instruments)
-        )
+        return replace(self, motors=(), drives=self.all_drives, geophones=None, instruments=self.all_instruments)
 
     def with_directions_by(self, names: Collection[str]) -> AvisTable:
         """The same table, with the direction of each channel given by the two components that are among these names of
@@ -331,37 +314,17 @@ class AvisTable(Rig):
         found |= {one.name: Place(np.array(one.position), "sensor") for one in self.sensors()}
         return found | {"centre of mass": Place(np.array(self.centre_of_mass), "centre of mass")}
 
-    def sensors(self) -> tuple[Sensor, ...]:
-        """The geophones in the isolators (fig. 2.2), then the instruments at other positions."""
-        return self._sensors
-
     @cached_property
-    def _sensors(self) -> tuple[Sensor, ...]:
-        return tuple(
-            one.sensor(self.acquisition, self.ambient).with_electronics(
-                self.electronics, one.preamplifier_gain, self.converter, self.sample_rate_Hz
-            )
-            for one in (*self._attached(), *self.instruments)
-        )
-
-    def _attached(self) -> tuple[GeophoneAt, ...]:
+    def all_instruments(self) -> tuple[Instrument, ...]:
+        """The geophones in the isolators (fig. 2.2), then the instruments at other positions."""
         if (g := self.geophones) is None:
-            return ()
-        channels = zip(g.names, g.isolator, g.axis, g.sensitivity_Vs_per_m, strict=True)
-        return tuple(
-            GeophoneAt(
-                name,
-                self._at(isolator),
-                _unit(axis),
-                sensitivity,
-                g.suspension_Hz,
-                g.suspension_damping,
-                g.compensated_Hz,
-                g.compensated_damping,
-                g.preamplifier_gain,
-            )
-            for name, isolator, axis, sensitivity in channels
+            return self.instruments
+        chain = (g.suspension_Hz, g.suspension_damping, g.compensated_Hz, g.compensated_damping)
+        attached = (
+            GeophoneAt(name, self._at(isolator), _unit(axis), volts, *chain, preamplifier_gain=g.preamplifier_gain)
+            for name, isolator, axis, volts in zip(g.names, g.isolator, g.axis, g.sensitivity_Vs_per_m, strict=True)
         )
+        return (*attached, *self.instruments)
 
     def with_sensor_gains(self, gains: Mapping[str, float]) -> AvisTable:
         g = self.geophones
@@ -374,9 +337,7 @@ class AvisTable(Rig):
         return replace(
             self,
             geophones=g,
-            instruments=tuple(
-                with_gain(one, gains[one.name]) if one.name in gains else one for one in self.instruments
-            ),
+            instruments=tuple(one.with_gain(gains[one.name]) if one.name in gains else one for one in self.instruments),
         )
 
     def _at(self, isolator: int) -> Triple:

@@ -1,59 +1,65 @@
-"""Data of sensors, acquisition and site in a rig file; their dynamics are built elsewhere."""
+"""Data of sensors, acquisition and site in a rig file, with its keys; their dynamics are built elsewhere."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import BeforeValidator, Field
+
+from avis_ctrl.rigs.converter import bits_of
+from avis_ctrl.rigs.file_errors import Values
+from avis_ctrl.rigs.key_types import Axis, NotNegative, Positive, Whole
 
 
 @dataclass(frozen=True)
-class Geophones:
+class Geophones(Values):
     """Geophones in the isolators, their compensation filter and preamplifier (Rademakers, section 2.1.1).
 
     isolator : 1-based number. axis : x, y or z. sensitivity_Vs_per_m : one value per channel.
     """
 
     names: tuple[str, ...]
-    isolator: tuple[int, ...]
-    axis: tuple[str, ...]
-    sensitivity_Vs_per_m: tuple[float, ...]
-    suspension_Hz: float
-    suspension_damping: float
-    compensated_Hz: float
-    compensated_damping: float
-    preamplifier_gain: float
+    isolator: tuple[Whole, ...]
+    axis: tuple[Axis, ...]
+    sensitivity_Vs_per_m: tuple[Positive, ...]
+    suspension_Hz: Positive
+    suspension_damping: Positive
+    compensated_Hz: Positive
+    compensated_damping: Positive
+    preamplifier_gain: Positive
 
 
 @dataclass(frozen=True)
-class Accelerometers:
+class Accelerometers(Values):
     """Accelerometers at actuators, along the actuators' axes, with sample rate and delay of their control loop."""
 
-    at: tuple[str, ...]
-    sensitivity_Vs2_per_m: float
-    low_corner_Hz: float
-    noise_m_per_s2_rtHz: float
-    sample_rate_Hz: float
-    loop_delay_s: float
-    drive_limit_V: float
+    at: Annotated[tuple[str, ...], Field(min_length=1)]
+    sensitivity_Vs2_per_m: Positive
+    low_corner_Hz: Positive
+    noise_m_per_s2_rtHz: NotNegative
+    sample_rate_Hz: Positive
+    loop_delay_s: NotNegative
+    drive_limit_V: Positive
 
 
 @dataclass(frozen=True)
-class Acquisition:
+class Acquisition(Values):
     """Converter with the range +-adc_range_V. loop_delay_s : from sample to actuator voltage."""
 
-    sample_rate_Hz: float
-    adc_bits: int
-    adc_range_V: float
-    loop_delay_s: float
+    sample_rate_Hz: Positive
+    adc_bits: Annotated[int, BeforeValidator(bits_of)]
+    adc_range_V: Positive
+    loop_delay_s: NotNegative
 
 
 @dataclass(frozen=True)
-class Ambient:
+class Ambient(Values):
     """Normal conditions on site: r.m.s. floor velocity per direction, 0.5-60 Hz, and sensor noise per channel."""
 
-    floor_velocity_rms_m_per_s: float
-    sensor_noise_rms_V: float
+    floor_velocity_rms_m_per_s: NotNegative
+    sensor_noise_rms_V: NotNegative
 
 
 @dataclass(frozen=True)

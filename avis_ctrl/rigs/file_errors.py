@@ -7,10 +7,12 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
 
 from avis_ctrl.errors import InputError
 
@@ -20,18 +22,20 @@ _UNITS = (
     "gmm2 kgmm2 gcm2"
 )
 
+# An unknown key, in a pydantic model and in a dataclass.
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 # Wording of pydantic, such as "Input should be greater than or equal to 1", replaced by that of these messages.
 _PLAIN = (
     ("^Input should be ", "expected "),
     ("expected a valid number", "expected a number"),
     ("expected a valid integer", "expected a whole number"),
     ("expected a valid string", "expected text in quotes"),
-    ("expected a valid list", "expected a list in square brackets"),
+    ("expected a valid (list|tuple)", "expected a list in square brackets"),
     ("expected a valid boolean", "expected true or false"),
     (r"expected greater than or equal to (\S+)", r"expected a number, \1 or more"),
     (r"expected less than or equal to (\S+)", r"expected a number, \1 or less"),
     ("expected (greater|less) than", r"expected a number \1 than"),
-    (r"^List should have (.* items?) after validation, not (\d+)", r"expected \1; the list has \2"),
+    (r"^(?:List|Tuple) should have (.* items?) after validation, not (\d+)", r"expected \1; the list has \2"),
 )
 
 
@@ -39,6 +43,15 @@ class Section(BaseModel):
     """A section of a file: only the declared keys, each of its declared type."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class Values:
+    """Base of a dataclass that a section of a file is read into: only the declared keys.
+
+    The types of its fields (`key_types`) say what is read; objects made in the program are not checked.
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def validated(model: type[Content], content: object, file: object = None) -> Content:
@@ -57,17 +70,20 @@ def first_complaint(error: ValidationError, model: type[BaseModel]) -> InputErro
     """
     # An unknown key explains the missing key next to it, so it comes first.
     problems = error.errors()
-    problem = min(problems, key=lambda one: one["type"] != "extra_forbidden")
+    problem = min(problems, key=lambda one: one["type"] not in _UNKNOWN)
     *parents, last = problem["loc"] or ("file",)
     field = dotted(problem["loc"])
-    if problem["type"] == "extra_forbidden":
+    if problem["type"] in _UNKNOWN:
+        inner = _section_at(model, parents)
+        known = list(keys_of(inner)) if inner else []
         value = None if isinstance(problem["input"], (dict, list)) else problem["input"]
         absent = [str(one["loc"][-1]) for one in problems if one["type"] == "missing" and [*one["loc"][:-1]] == parents]
-        return InputError(_unknown_key(str(last), absent, _known_keys(model, parents)), field=field, value=value)
+        return InputError(_unknown_key(str(last), absent, known), field=field, value=value)
     if problem["type"] == "missing":
-        return InputError(f"this {_kind_of_entry(model, parents, str(last))} is missing", field=field)
+        kind = "section" if _section_at(model, [*parents, last]) else "key"
+        return InputError(f"this {kind} is missing", field=field)
     value = problem["input"]
-    if problem["type"] in ("model_type", "dict_type", "model_attributes_type"):
+    if problem["type"] in ("model_type", "dict_type", "model_attributes_type", "dataclass_type"):
         return InputError("expected a section of keys", field=field, value=value)
     words = problem["msg"].removeprefix("Value error, ")
     for pattern, plain in _PLAIN:
@@ -103,32 +119,32 @@ def _stem(key: str) -> str:
     return "_".join(parts)
 
 
-def _known_keys(model: type[BaseModel], parents: Sequence[int | str]) -> list[str]:
-    for part in parents:
-        if isinstance(part, str):
-            inner = _model_within(model.model_fields[part].annotation)
-            if inner is None:
-                return []
-            model = inner
-    return list(model.model_fields)
+def keys_of(model: type[Any]) -> dict[str, Any]:
+    """Annotation of each key of a section, which is a `Section` or a dataclass of `Values`."""
+    if issubclass(model, BaseModel):
+        return {name: one.annotation for name, one in model.model_fields.items()}
+    found, annotations = {}, get_type_hints(model, include_extras=True)
+    for one in fields(model):
+        notes = [note for note in get_args(annotations[one.name]) if isinstance(note, FieldInfo)]
+        if not any(note.exclude for note in notes):
+            found[next((note.alias for note in notes if note.alias), one.name)] = annotations[one.name]
+    return found
 
 
-def _kind_of_entry(model: type[BaseModel], parents: Sequence[int | str], key: str) -> str:
-    """Kind of a missing entry: "key" (with a value) or "section" (of keys)."""
-    for part in (one for one in (*parents, key) if isinstance(one, str)):
-        annotation = model.model_fields[part].annotation if part in model.model_fields else None
-        inner = _model_within(annotation)
-        if inner is None:
-            return "key"
-        model = inner
-    return "section"
-
-
-def _model_within(annotation: Any) -> type[BaseModel] | None:
-    """The section's model in an annotation such as list[Section] or Section | None."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def section_in(annotation: Any) -> type[Any] | None:
+    """The section in an annotation such as list[Section] or Section | None."""
+    if isinstance(annotation, type) and (issubclass(annotation, BaseModel) or is_dataclass(annotation)):
         return annotation
-    return next((found for part in get_args(annotation) if (found := _model_within(part))), None)
+    return next((found for part in get_args(annotation) if (found := section_in(part))), None)
+
+
+def _section_at(model: type[Any], place: Sequence[int | str]) -> type[Any] | None:
+    """The section at a place of the content; None for a value."""
+    found: type[Any] | None = model
+    for part in place:
+        if isinstance(part, str) and found is not None:
+            found = section_in(keys_of(found).get(part))
+    return found
 
 
 def read_toml(path: Path, expected: str) -> dict[str, Any]:

@@ -7,16 +7,17 @@ second derivatives in eq. 4, K(4,4) = (k_a + k_s) L_2^2 + 2 k_a L_6^2, E(3,1..4)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.instruments import Sensor, Tolerances, triple, white_rms
+from avis_ctrl.rigs.equipment import Accelerometers, Ambient, Electronics
+from avis_ctrl.rigs.instruments import AccelerometerAt, Tolerances, triple
 from avis_ctrl.rigs.mounted_body import Mount, MountedBody, PointActuator
 from avis_ctrl.rigs.rig import Parameter, Place, Rig
-from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, point_map
 
 _ROOT_HALF = np.sqrt(0.5)
 # Signs of (x, y): corners at which actuator A_i and spring i are placed, and force directions of A5..A8.
@@ -128,8 +129,6 @@ class Halcyonics(Rig):
     load: Load | None = None
     M2_arm: float = 0.2
     M3_arm: float = 0.15
-    geophones: Geophones | None = None
-    acquisition: Acquisition | None = None
     ambient: Ambient | None = None
     tolerances: Tolerances | None = None
     electronics: Electronics = field(default_factory=Electronics)
@@ -157,34 +156,13 @@ class Halcyonics(Rig):
             self, accelerometers=replace(self.accelerometers, drive_limit_V=min(self.drive_limit_V, limit_V))
         )
 
-    def with_loop_delay(self, delay_s: float) -> Halcyonics:
-        return replace(self, accelerometers=replace(self.accelerometers, loop_delay_s=delay_s))
-
-    @property
-    def sample_rate_Hz(self) -> float:
-        return self.accelerometers.sample_rate_Hz
-
-    @property
-    def loop_delay_s(self) -> float:
-        return self.accelerometers.loop_delay_s
-
     def mass_matrix(self) -> np.ndarray:
         """M of eq. 16."""
         M = np.diag([self.mass] * 3 + [self.Ixx, self.Iyy, self.Izz])
-        if self.load is None:
-            return M
-        m_e, L7, L8, L9 = self.load.mass, self.load.L7, self.load.L8, self.load.L9
-        coupling = m_e * np.array([[0, L9, -L8], [-L9, 0, L7], [L8, -L7, 0]])
-        M[:3, :3] += m_e * np.eye(3)
-        M[:3, 3:] += coupling
-        M[3:, :3] += coupling.T
-        M[3:, 3:] += self.load.inertia() + m_e * np.array(
-            [
-                [L8**2 + L9**2, -L7 * L8, -L7 * L9],
-                [-L7 * L8, L7**2 + L9**2, -L8 * L9],
-                [-L7 * L9, -L8 * L9, L7**2 + L8**2],
-            ]
-        )
+        if self.load is not None:
+            G = point_map(self.load.position())
+            M += self.load.mass * G.T @ G
+            M[3:, 3:] += self.load.inertia()
         return M
 
     def damping_matrix(self) -> np.ndarray:
@@ -282,26 +260,14 @@ class Halcyonics(Rig):
         }
         return found | ({"load": Place(self.load.position(), "load")} if self.load else {})
 
-    def sensors(self) -> tuple[Sensor, ...]:
+    @cached_property
+    def all_instruments(self) -> tuple[AccelerometerAt, ...]:
         """The built-in accelerometers (section 3.1): "acc_A1" at actuator A1 along its axis, and so on."""
         axes, acc = self.actuator_axes(), self.accelerometers
-        noise = white_rms(acc.noise_m_per_s2_rtHz, acc.sensitivity_Vs2_per_m, acc.sample_rate_Hz)
-        pole = complex(-2 * np.pi * acc.low_corner_Hz)
-        bare = [
-            Sensor(
-                f"acc_{name}",
-                triple(axes[name][0]),
-                triple(axes[name][1]),
-                "acceleration",
-                (0j,),
-                (pole,),
-                acc.sensitivity_Vs2_per_m,
-                noise,
-                noise_density=acc.noise_m_per_s2_rtHz,
-            )
-            for name in acc.at
-        ]
-        return tuple(one.with_electronics(self.electronics, 1.0, self.converter, self.sample_rate_Hz) for one in bare)
+        chain = (acc.sensitivity_Vs2_per_m, acc.low_corner_Hz, acc.noise_m_per_s2_rtHz)
+        return tuple(
+            AccelerometerAt(f"acc_{name}", triple(axes[name][0]), triple(axes[name][1]), *chain) for name in acc.at
+        )
 
     def force_constant(self, actuator: str) -> str:
         return f"e{self.actuator_names.index(actuator) + 1}"

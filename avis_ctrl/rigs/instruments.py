@@ -10,18 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.converter import Converter, white_density
-from avis_ctrl.rigs.equipment import Acquisition, Ambient, Electronics
+from avis_ctrl.rigs.equipment import Ambient, Electronics
+from avis_ctrl.rigs.file_errors import Values
 from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity
+from avis_ctrl.rigs.key_types import Axis, Direction, Name, NotNegative, Percent, Point, Positive
 
-Triple = tuple[float, float, float]
+Triple = tuple[float, ...]
 
 
 def triple(values: Iterable[float]) -> Triple:
@@ -30,28 +33,38 @@ def triple(values: Iterable[float]) -> Triple:
     return x, y, z
 
 
-def unit_vector(direction: Triple, field: str) -> Triple:
-    """The direction scaled to unit length, unchanged if it has that length. Raises InputError for a zero vector."""
-    length = float(np.linalg.norm(direction))
-    if not (np.isfinite(length) and length > 0):
-        raise InputError("expected a vector that is not zero", field=field, value=list(direction))
-    if abs(length - 1.0) <= 1e-12:
-        return direction
-    return triple(part / length for part in direction)
+def _no_key(value: Any) -> None:
+    # How a fit turns a direction is no property of the channel.
+    raise ValueError("unknown key")
+
+
+def _both(damping: float | None, info: ValidationInfo) -> float | None:
+    if (damping is None) != (info.data.get("compensated_Hz") is None):
+        raise ValueError("expected compensated_Hz and compensated_damping, both or neither")
+    return damping
+
+
+def _alone(rms_V: float | None, info: ValidationInfo) -> float | None:
+    density = next((name for name, value in info.data.items() if name.endswith("_rtHz") and value is not None), None)
+    if rms_V is not None and density is not None:
+        raise ValueError(f"expected noise_rms_V or {density}, not both")
+    return rms_V
 
 
 @dataclass(frozen=True)
-class Channel:
+class Channel(Values):
     """A drive or sensor at a position [m] with a direction (unit vector with sign).
 
     dependent : index of the component of the direction that follows from the other two, by the unit length; None for
         the largest (`along`). It does not change while a fit turns the direction, even if another becomes the largest.
     """
 
-    name: str
-    position: Triple
-    direction: Triple
-    dependent: int | None = field(default=None, kw_only=True, compare=False, repr=False)
+    name: Name
+    position: Annotated[Point, Field(alias="position_m")]
+    direction: Direction
+    dependent: Annotated[int | None, Field(exclude=True), BeforeValidator(_no_key)] = field(
+        default=None, kw_only=True, compare=False, repr=False
+    )
 
     @property
     def along(self) -> int:
@@ -81,8 +94,8 @@ class Channel:
 class Drive(Channel):
     """A force constant_N_per_V * volts along the direction. limit_V : None for the rig's common limit."""
 
-    constant_N_per_V: float
-    limit_V: float | None = None
+    constant_N_per_V: Positive
+    limit_V: Positive | None = None
 
 
 @dataclass(frozen=True)
@@ -169,146 +182,138 @@ class Sensor(Channel):
 
 
 @dataclass(frozen=True)
-class GeophoneAt(Channel):
-    """A geophone of a rig file. compensated_Hz : None for no filter. noise_rms_V : None for the ambient noise."""
+class Instrument(Channel):
+    """A sensor of a rig file.
 
-    sensitivity_Vs_per_m: float
-    suspension_Hz: float
-    suspension_damping: float
-    compensated_Hz: float | None = None
-    compensated_damping: float | None = None
-    preamplifier_gain: float = 1.0
-    noise_rms_V: float | None = None
+    noise_rms_V : r.m.s. of its white noise per sample; None for that of its density, or the ambient noise.
+    sensitivity, density : names of the fields with its sensitivity and its noise density, if it has one.
+    """
 
-    def sensor(self, acquisition: Acquisition, ambient: Ambient | None) -> Sensor:
+    quantity: ClassVar[Quantity]
+    sensitivity: ClassVar[str]
+    density: ClassVar[str | None] = None
+    zeros: ClassVar[tuple[complex, ...]] = ()
+
+    preamplifier_gain: Positive = field(default=1.0, kw_only=True)
+    noise_rms_V: Annotated[NotNegative | None, AfterValidator(_alone)] = field(default=None, kw_only=True)
+
+    def poles(self) -> tuple[complex, ...]:
+        """Of the sensor and its filter [rad/s]."""
+        raise NotImplementedError
+
+    @property
+    def gain(self) -> float:
+        """Volts per unit of motion, preamplifier included."""
+        return float(getattr(self, self.sensitivity) * self.preamplifier_gain)
+
+    def with_gain(self, gain: float) -> Self:
+        """The instrument with another gain."""
+        changed: dict[str, Any] = {self.sensitivity: gain / self.preamplifier_gain}
+        return replace(self, **changed)
+
+    def sensor(self, sample_rate_Hz: float, ambient: Ambient | None = None) -> Sensor:
         """The channel of this instrument."""
+        density = None if self.density is None else getattr(self, self.density)
+        noise = self.noise_rms_V
+        if noise is None and density is not None:
+            noise = float(density * self.gain * np.sqrt(sample_rate_Hz / 2))  # band-limited to half the sample rate
+        elif noise is None:
+            noise = ambient.sensor_noise_rms_V if ambient else 0.0
+        return Sensor(
+            self.name,
+            self.position,
+            self.direction,
+            self.quantity,
+            self.zeros,
+            self.poles(),
+            self.gain,
+            noise,
+            noise_density=density,
+        )
+
+
+@dataclass(frozen=True)
+class GeophoneAt(Instrument):
+    """A geophone of a rig file. compensated_Hz : None for no filter."""
+
+    quantity = "velocity"
+    sensitivity = "sensitivity_Vs_per_m"
+    zeros = (0j, 0j)
+
+    sensitivity_Vs_per_m: Positive
+    suspension_Hz: Positive
+    suspension_damping: Positive
+    compensated_Hz: Positive | None = None
+    compensated_damping: Annotated[Positive | None, Field(validate_default=True), AfterValidator(_both)] = None
+
+    def poles(self) -> tuple[complex, ...]:
         corner, damping = self.suspension_Hz, self.suspension_damping
         if self.compensated_Hz is not None and self.compensated_damping is not None:
             # The filter is assumed to match this suspension exactly: its zeros cancel the geophone's poles.
             corner, damping = self.compensated_Hz, self.compensated_damping
-        noise = _noise_rms(self.noise_rms_V, None, 1.0, acquisition, ambient)
-        return Sensor(
-            self.name,
-            self.position,
-            self.direction,
-            "velocity",
-            (0j, 0j),
-            tuple(second_order_roots(corner, damping).tolist()),
-            self.sensitivity_Vs_per_m * self.preamplifier_gain,
-            noise,
-            (self.suspension_Hz, self.suspension_damping),
-        )
+        return tuple(second_order_roots(corner, damping).tolist())
+
+    def sensor(self, sample_rate_Hz: float, ambient: Ambient | None = None) -> Sensor:
+        one = super().sensor(sample_rate_Hz, ambient)
+        return replace(one, suspension=(self.suspension_Hz, self.suspension_damping))
 
 
 @dataclass(frozen=True)
-class AccelerometerAt(Channel):
+class AccelerometerAt(Instrument):
     """A charge-amplified accelerometer of a rig file: S s/(s + w) from acceleration, with white output noise."""
 
-    sensitivity_Vs2_per_m: float
-    low_corner_Hz: float
-    noise_m_per_s2_rtHz: float | None = None
-    preamplifier_gain: float = 1.0
-    noise_rms_V: float | None = None
+    quantity = "acceleration"
+    sensitivity, density = "sensitivity_Vs2_per_m", "noise_m_per_s2_rtHz"
+    zeros = (0j,)
 
-    def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
-        """The channel of this instrument."""
-        gain = self.sensitivity_Vs2_per_m * self.preamplifier_gain
-        noise = _noise_rms(self.noise_rms_V, self.noise_m_per_s2_rtHz, gain, acquisition, ambient)
-        return Sensor(
-            self.name,
-            self.position,
-            self.direction,
-            "acceleration",
-            (0j,),
-            (complex(-2 * np.pi * self.low_corner_Hz),),
-            gain,
-            noise,
-            noise_density=self.noise_m_per_s2_rtHz,
-        )
+    sensitivity_Vs2_per_m: Positive
+    low_corner_Hz: Positive
+    noise_m_per_s2_rtHz: NotNegative | None = None
 
-
-def white_rms(density: float, gain: float, sample_rate_Hz: float) -> float:
-    """R.m.s. per sample [V] of a noise density of motion, band-limited to half the sample rate."""
-    return float(density * gain * np.sqrt(sample_rate_Hz / 2))
-
-
-def _noise_rms(
-    rms_V: float | None, density: float | None, gain: float, acquisition: Acquisition, ambient: Ambient | None
-) -> float:
-    """Noise stated in the file for a sensor, otherwise the ambient noise of the channels."""
-    if rms_V is not None:
-        return rms_V
-    if density is not None:
-        return white_rms(density, gain, acquisition.sample_rate_Hz)
-    return ambient.sensor_noise_rms_V if ambient else 0.0
+    def poles(self) -> tuple[complex, ...]:
+        return (complex(-2 * np.pi * self.low_corner_Hz),)
 
 
 @dataclass(frozen=True)
-class PositionSensorAt(Channel):
+class PositionSensorAt(Instrument):
     """A position sensor of a rig file, payload relative to chassis. bandwidth_Hz : first-order lag, None for none."""
 
-    sensitivity_V_per_m: float
-    bandwidth_Hz: float | None = None
-    noise_m_rtHz: float | None = None
-    preamplifier_gain: float = 1.0
-    noise_rms_V: float | None = None
+    quantity = "displacement"
+    sensitivity, density = "sensitivity_V_per_m", "noise_m_rtHz"
 
-    def sensor(self, acquisition: Acquisition, ambient: Ambient | None = None) -> Sensor:
-        """The channel of this instrument."""
-        gain = self.sensitivity_V_per_m * self.preamplifier_gain
-        poles = () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
-        noise = _noise_rms(self.noise_rms_V, self.noise_m_rtHz, gain, acquisition, ambient)
-        return Sensor(
-            self.name,
-            self.position,
-            self.direction,
-            "displacement",
-            (),
-            poles,
-            gain,
-            noise,
-            noise_density=self.noise_m_rtHz,
-        )
+    sensitivity_V_per_m: Positive
+    bandwidth_Hz: Positive | None = None
+    noise_m_rtHz: NotNegative | None = None
 
-
-Instrument = GeophoneAt | AccelerometerAt | PositionSensorAt
-
-
-def with_gain(instrument: Instrument, gain: float) -> Instrument:
-    """The instrument with another gain, in volts per unit of motion, preamplifier included."""
-    sensitivity = gain / instrument.preamplifier_gain
-    if isinstance(instrument, GeophoneAt):
-        return replace(instrument, sensitivity_Vs_per_m=sensitivity)
-    if isinstance(instrument, AccelerometerAt):
-        return replace(instrument, sensitivity_Vs2_per_m=sensitivity)
-    return replace(instrument, sensitivity_V_per_m=sensitivity)
+    def poles(self) -> tuple[complex, ...]:
+        return () if self.bandwidth_Hz is None else (complex(-2 * np.pi * self.bandwidth_Hz),)
 
 
 @dataclass(frozen=True)
-class FloorSensor:
+class FloorSensor(Values):
     """The sensor of a floor-velocity channel of a campaign, along x, y or z of the floor.
 
     noise_rms_m_per_s : r.m.s. of the white noise per sample, as floor velocity.
     """
 
-    name: str
-    axis: str
-    noise_rms_m_per_s: float
+    name: Name
+    axis: Axis
+    noise_rms_m_per_s: NotNegative
 
 
 @dataclass(frozen=True)
-class Tolerances:
+class Tolerances(Values):
     """Standard deviations of the values of a rig file.
 
     place_m : of every coordinate of isolators, drives and sensors. direction_rad : of the direction of every drive and
     sensor, about both normals.
     """
 
-    place_m: float = 0.001
-    direction_rad: float = 0.005
-    actuator_gain_percent: float = 1.0
-    sensor_gain_percent: float = 1.0
-    sensor_corner_percent: float = 1.0
-    sensor_damping_percent: float = 3.0
-    centre_of_mass_m: float = 0.001
-    product_of_inertia_kgm2: float = 0.2
+    place_m: NotNegative = 0.001
+    direction_rad: NotNegative = 0.005
+    actuator_gain_percent: Percent = 1.0
+    sensor_gain_percent: Percent = 1.0
+    sensor_corner_percent: Percent = 1.0
+    sensor_damping_percent: Percent = 3.0
+    centre_of_mass_m: NotNegative = 0.001
+    product_of_inertia_kgm2: NotNegative = 0.2

@@ -10,23 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, point_map
-
-
-def _array(value: ArrayLike, shape: tuple[int, ...], name: str) -> np.ndarray:
-    array = np.array(value, dtype=float)
-    if array.shape != shape or not np.all(np.isfinite(array)):
-        raise InputError(f"expected finite numbers of shape {shape}", field=name, value=array.tolist())
-    array.setflags(write=False)
-    return array
-
-
-def _freeze(thing: object, **shapes: tuple[int, ...]) -> None:
-    for name, shape in shapes.items():
-        object.__setattr__(thing, name, _array(getattr(thing, name), shape, name))
+from avis_ctrl.rigs.rigid_body import EquationsOfMotion, cross_matrix, freeze, point_map
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +30,7 @@ class Mount:
     damping: np.ndarray
 
     def __post_init__(self) -> None:
-        _freeze(self, position=(3,), chassis_point=(3,), stiffness=(3, 3), damping=(3, 3))
+        freeze(self, position=(3,), chassis_point=(3,), stiffness=(3, 3), damping=(3, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +43,7 @@ class PointActuator:
     constant_N_per_V: float
 
     def __post_init__(self) -> None:
-        _freeze(self, position=(3,), direction=(3,))
+        freeze(self, position=(3,), direction=(3,))
         length = float(np.linalg.norm(self.direction))
         if not abs(length - 1.0) <= 1e-9:
             raise InputError("expected a unit vector", field=f"direction of {self.name}", value=length)
@@ -90,7 +76,7 @@ class MountedBody:
     damping: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
 
     def __post_init__(self) -> None:
-        _freeze(self, inertia=(3, 3), centre_of_mass=(3,), stiffness=(6, 6), damping=(6, 6))
+        freeze(self, inertia=(3, 3), centre_of_mass=(3,), stiffness=(6, 6), damping=(6, 6))
         if not (np.isfinite(self.mass) and self.mass > 0):
             raise InputError("expected a positive mass in kg", field="mass", value=self.mass)
         if not np.allclose(self.inertia, self.inertia.T) or np.min(np.linalg.eigvalsh(self.inertia)) <= 0:

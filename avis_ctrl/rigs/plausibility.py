@@ -8,7 +8,7 @@ with the fewest unusual values, is reported.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -228,7 +228,7 @@ def judged(content: dict[str, Any], rig: Rig, ranges: PlausibleRanges = RANGES) 
         _shape(rig, body, centre, radius, judge)
     _drives(rig, eom, radius, judge)
     _alike(numbers, body, judge)
-    _signal_levels(content, judge)
+    _signal_levels(rig, judge)
     return found
 
 
@@ -345,22 +345,15 @@ def _clock(rig: Rig, f: float, judge: Judge) -> None:
     )
 
 
-def _signal_levels(content: dict[str, Any], judge: Judge) -> None:
+def _signal_levels(rig: Rig, judge: Judge) -> None:
     """Full scale of the velocity sensors, and their signal and noise relative to converter range and floor motion."""
-
-    def of(section: str, key: str) -> float | None:
-        part = content.get(section)
-        value = part.get(key) if isinstance(part, dict) else None
-        return float(value) if isinstance(value, (int, float)) and value > 0 else None
-
-    full = of("acquisition", "adc_range_V")
-    bits = of("acquisition", "adc_bits") or 16
-    noise = of("ambient", "sensor_noise_rms_V") or 0.0
-    floor = of("ambient", "floor_velocity_rms_m_per_s")
-    for name, gain in _velocity_sensors(content):
-        if full is not None:
-            judge("full_scale_m_per_s", full / gain, f"full scale {full / gain:.2g} m/s of {name}")
-        if full is not None and floor is not None:
+    converter, ambient = rig.acquisition, rig.ambient
+    for one in rig.sensors():
+        if converter is None or one.quantity != "velocity":
+            continue
+        name, gain, full = one.name, one.gain, converter.adc_range_V
+        judge("full_scale_m_per_s", full / gain, f"full scale {full / gain:.2g} m/s of {name}")
+        if ambient is not None and (floor := ambient.floor_velocity_rms_m_per_s) > 0:
             share = floor * gain / full
             judge(
                 "floor_share",
@@ -368,18 +361,7 @@ def _signal_levels(content: dict[str, Any], judge: Judge) -> None:
                 f"the floor motion alone, {floor:.2g} m/s, uses a fraction of {share:.2g} of "
                 f"the converter's range at {name}",
             )
-            own = max(noise, full * 2.0 ** (1 - bits) / np.sqrt(12)) / gain
+            rounding = full * 2.0 ** (1 - converter.adc_bits) / np.sqrt(12)
+            own = max(ambient.sensor_noise_rms_V, rounding) / gain
             ratio = own / floor
             judge("noise_ratio", ratio, f"noise of {name} {own:.2g} m/s, {ratio:.3g} times the floor motion")
-
-
-def _velocity_sensors(content: dict[str, Any]) -> Iterator[tuple[str, float]]:
-    """Name and gain [V s/m] of every geophone, from the section of lists and from the tables of single geophones."""
-    together = content.get("geophones")
-    parts: list[Any] = content.get("geophone") or []
-    if isinstance(together, dict):
-        gain = together.get("preamplifier_gain", 1.0)
-        for name, value in zip(together["names"], together["sensitivity_Vs_per_m"], strict=True):
-            yield name, value * gain
-    for part in parts:
-        yield part["name"], part["sensitivity_Vs_per_m"] * part.get("preamplifier_gain", 1.0)

@@ -6,6 +6,7 @@ import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.converter import Converter
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
-from avis_ctrl.rigs.instruments import FloorSensor, Sensor, Tolerances
+from avis_ctrl.rigs.instruments import FloorSensor, Instrument, Sensor, Tolerances
 from avis_ctrl.rigs.mounted_body import MountedBody
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, point_map, tilt_row
 
@@ -46,9 +47,9 @@ class Rig(ABC):
     gain_per_sensor: ClassVar[bool] = False
 
     name: str
-    geophones: Geophones | None
-    accelerometers: Accelerometers | None
-    acquisition: Acquisition | None
+    geophones: Geophones | None = None
+    accelerometers: Accelerometers | None = None
+    acquisition: Acquisition | None = None
     ambient: Ambient | None
     tolerances: Tolerances | None
     floor_sensors: tuple[FloorSensor, ...] = ()
@@ -77,23 +78,30 @@ class Rig(ABC):
     def with_drives_limited(self, limit_V: float) -> Self:
         """The rig with all drives limited to at most this voltage; lower limits are kept."""
 
-    @abstractmethod
     def with_loop_delay(self, delay_s: float) -> Self:
         """The rig with another delay from sample to drive voltage."""
+        clocked = {"acquisition" if self.acquisition else "accelerometers": replace(self._clock, loop_delay_s=delay_s)}
+        return replace(self, **clocked)  # type: ignore[type-var]
 
     def with_electronics(self, electronics: Electronics) -> Self:
         """The rig with other electronics of its channels: offset, 1/f noise, anti-alias filter."""
         return replace(self, electronics=electronics)  # type: ignore[type-var]
 
     @property
-    @abstractmethod
-    def sample_rate_Hz(self) -> float:
-        """Sample rate of the controller."""
+    def _clock(self) -> Acquisition | Accelerometers:
+        found = self.acquisition or self.accelerometers
+        assert found is not None
+        return found
 
     @property
-    @abstractmethod
+    def sample_rate_Hz(self) -> float:
+        """Sample rate of the controller."""
+        return self._clock.sample_rate_Hz
+
+    @property
     def loop_delay_s(self) -> float:
         """Delay from the sample to the actuator voltage."""
+        return self._clock.loop_delay_s
 
     @abstractmethod
     def parameters(self) -> dict[str, Parameter]:
@@ -119,9 +127,22 @@ class Rig(ABC):
     def points(self) -> dict[str, Place]:
         """Named points for a drawing."""
 
+    @property
     @abstractmethod
+    def all_instruments(self) -> tuple[Instrument, ...]:
+        """Every sensor on the payload, as its rig file describes it."""
+
     def sensors(self) -> tuple[Sensor, ...]:
         """Every sensor on the payload, with its place and its dynamics."""
+        return self._sensors
+
+    @cached_property
+    def _sensors(self) -> tuple[Sensor, ...]:
+        rate, converter = self.sample_rate_Hz, self.converter
+        return tuple(
+            one.sensor(rate, self.ambient).with_electronics(self.electronics, one.preamplifier_gain, converter, rate)
+            for one in self.all_instruments
+        )
 
     @property
     def converter(self) -> Converter | None:

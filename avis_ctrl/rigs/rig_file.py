@@ -12,34 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.avis import AvisTable, Isolator, LinearMotor
-from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
+from avis_ctrl.rigs.avis import AvisTable, LinearMotor
+from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
-from avis_ctrl.rigs.instruments import (
-    AccelerometerAt,
-    Drive,
-    FloorSensor,
-    GeophoneAt,
-    Instrument,
-    PositionSensorAt,
-    Tolerances,
-    triple,
-    unit_vector,
-)
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
-from avis_ctrl.rigs.rig_sections import (
-    AmbientSection,
-    AvisFile,
-    HalcyonicsFile,
-    IsolatorSection,
-    LoadSection,
-    PlateSection,
-    TolerancesSection,
-)
+from avis_ctrl.rigs.rig_sections import AvisFile, HalcyonicsFile, LoadSection, PlateSection, symbol_of
 from avis_ctrl.rigs.rigid_body import COORDINATES
 
 SHIPPED = {
@@ -125,7 +105,7 @@ def _avis(file: AvisFile) -> AvisTable:
     for name, (section, own) in lists.items():
         if section is None:
             continue
-        _same_length(name, section.model_dump(), ("names", "isolator", "axis", own))
+        _same_length(name, vars(section), ("names", "isolator", "axis", own))
         if bad := [number for number in section.isolator if not 1 <= number <= len(file.isolator)]:
             raise InputError(
                 f"expected isolators from 1 to {len(file.isolator)}", field=f"{name}.isolator", value=bad[0]
@@ -133,26 +113,23 @@ def _avis(file: AvisFile) -> AvisTable:
     J = np.diag(payload.inertia_kgm2)
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
-    isolators = tuple(_isolator(one) for one in file.isolator)
-    inertia = (*triple(payload.inertia_kgm2), *triple(payload.inertia_offdiagonal_kgm2))
     rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True) if motors else ()
-    drives = tuple(Drive(**_at_place(one)) for one in file.drive)
     table = AvisTable(
         file.name,
         payload.mass_kg,
-        inertia,
-        triple(payload.centre_of_mass_m),
-        isolators,
+        (*payload.inertia_kgm2, *payload.inertia_offdiagonal_kgm2),
+        payload.centre_of_mass_m,
+        tuple(file.isolator),
         tuple(LinearMotor(*row) for row in rows),
         _common_limit(file),
-        Geophones(**_tuples(geophones)) if geophones else None,
-        Acquisition(**_tuples(file.acquisition)),
-        _ambient(file.ambient),
-        drives=drives,
-        instruments=_instruments(file),
-        floor_sensors=tuple(FloorSensor(**_tuples(one)) for one in file.floor_sensor),
-        tolerances=_tolerances(file.tolerances),
-        electronics=Electronics(**_tuples(file.electronics)),
+        geophones,
+        file.acquisition,
+        file.ambient,
+        drives=tuple(file.drive),
+        instruments=(*file.geophone, *file.accelerometer, *file.position_sensor),
+        floor_sensors=tuple(file.floor_sensor),
+        tolerances=file.tolerances,
+        electronics=Electronics(**file.electronics.model_dump()),
     )
     _distinct("drive", [one.name for one in table.all_drives])
     _distinct("geophone, accelerometer, position_sensor", [one.name for one in table.sensors()])
@@ -172,37 +149,6 @@ def _common_limit(file: AvisFile) -> float:
     return max((one.limit_V for one in file.drive if one.limit_V is not None), default=1.0)
 
 
-def _instruments(file: AvisFile) -> tuple[Instrument, ...]:
-    for k, geophone in enumerate(file.geophone, 1):
-        if (geophone.compensated_Hz is None) != (geophone.compensated_damping is None):
-            absent = "compensated_Hz" if geophone.compensated_Hz is None else "compensated_damping"
-            raise InputError(
-                "expected compensated_Hz and compensated_damping, both or neither", field=f"geophone[{k}].{absent}"
-            )
-    for name, sections in (("accelerometer", file.accelerometer), ("position_sensor", file.position_sensor)):
-        for k, one in enumerate(sections, 1):
-            density = "noise_m_per_s2_rtHz" if name == "accelerometer" else "noise_m_rtHz"
-            content = one.model_dump()
-            if content["noise_rms_V"] is not None and content[density] is not None:
-                raise InputError(
-                    f"expected noise_rms_V or {density}, not both",
-                    field=f"{name}[{k}].noise_rms_V",
-                    value=content["noise_rms_V"],
-                )
-    return (
-        *(GeophoneAt(**_at_place(one)) for one in file.geophone),
-        *(AccelerometerAt(**_at_place(one)) for one in file.accelerometer),
-        *(PositionSensorAt(**_at_place(one)) for one in file.position_sensor),
-    )
-
-
-def _at_place(section: BaseModel) -> dict[str, Any]:
-    """Arguments of a drive or sensor: the section, with its direction scaled to unit length."""
-    content = _tuples(section)
-    place = content.pop("position_m")
-    return content | {"position": place, "direction": unit_vector(content["direction"], "direction")}
-
-
 def _distinct(field: str, names: list[str], some: bool = True) -> None:
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
@@ -211,32 +157,19 @@ def _distinct(field: str, names: list[str], some: bool = True) -> None:
         raise InputError(f"expected at least one {field.split(',')[0]}", field=field)
 
 
-def _isolator(section: IsolatorSection) -> Isolator:
-    offset = np.subtract(section.chassis_point_m or section.position_m, section.position_m)
-    return Isolator(
-        triple(section.position_m),
-        triple(section.stiffness_N_per_m),
-        triple(section.damping_Ns_per_m),
-        triple(offset.tolist()),
-    )
-
-
 def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
     plate, suspension, actuators = file.payload, file.suspension, file.actuators
-    _same_length("actuators", actuators.model_dump(), ("names",))
-    _same_length("accelerometers", file.accelerometers.model_dump(), ("at",))
+    _same_length("actuators", vars(actuators), ("names",))
+    _same_length("accelerometers", vars(file.accelerometers), ("at",))
     if absent := [name for name in file.accelerometers.at if name not in actuators.names]:
         raise InputError(f"expected actuators out of {actuators.names}", field="accelerometers.at", value=absent[0])
     _check_inertia(np.diag(plate.inertia_kgm2), "payload.inertia_kgm2", plate.inertia_kgm2)
     load = _load(file.load, plate) if file.load else None
     if loaded and load is None:
         raise InputError("the loaded table was requested, but the rig file has no [load] section", field="load")
-    stiffness = {name.partition("_N")[0]: value for name, value in suspension.model_dump().items()}
+    stiffness = {symbol_of(key): value for key, value in suspension}
     k_s, each = stiffness.pop("k_s"), stiffness.pop("k_s_each")
-    lengths = {
-        name.removesuffix("_m"): getattr(plate, name)
-        for name in ("L1_m", "L2_m", "L3_m", "L4_plus_L5_m", "L6_m", "M2_arm_m", "M3_arm_m")
-    }
+    lengths = {symbol_of(key): value for key, value in plate if key.endswith("_m")}
     Ixx, Iyy, Izz = plate.inertia_kgm2
     return Halcyonics(
         file.name,
@@ -252,44 +185,22 @@ def _halcyonics(file: HalcyonicsFile, loaded: bool) -> Halcyonics:
         reaction=ReactionMass(
             actuators.reaction_mass_kg, actuators.reaction_damping_Ns_per_m, actuators.free_constant_N_per_V
         ),
-        accelerometers=Accelerometers(**_tuples(file.accelerometers)),
-        ambient=_ambient(file.ambient),
+        accelerometers=file.accelerometers,
+        ambient=file.ambient,
         load=load if loaded else None,
-        tolerances=_tolerances(file.tolerances),
-        electronics=Electronics(**_tuples(file.electronics)),
+        tolerances=file.tolerances,
+        electronics=Electronics(**file.electronics.model_dump()),
     )
-
-
-def _ambient(section: AmbientSection | None) -> Ambient | None:
-    return Ambient(**_tuples(section)) if section else None
-
-
-def _tolerances(section: TolerancesSection | None) -> Tolerances | None:
-    return Tolerances(**_tuples(section)) if section else None
 
 
 def _load(section: LoadSection, plate: PlateSection) -> Load:
     """Load from the totals of table 2, plate plus load (I_xx + I^e_xx) without the terms m_e L^2: see `Load`."""
     totals = np.array([section.Ixx_total_kgm2, section.Iyy_total_kgm2, section.Izz_total_kgm2])
-    Ixx, Iyy, Izz = (float(value) for value in totals - plate.inertia_kgm2)
-    load = Load(
-        section.mass_kg,
-        section.L7_m,
-        section.L8_m,
-        section.L9_m,
-        Ixx,
-        Iyy,
-        Izz,
-        section.Ixy_load_kgm2,
-        section.Ixz_load_kgm2,
-        section.Iyz_load_kgm2,
-    )
-    _check_inertia(
-        load.inertia(),
-        "load.Ixx_total_kgm2 .. Iyz_load_kgm2",
-        [*totals, section.Ixy_load_kgm2, section.Ixz_load_kgm2, section.Iyz_load_kgm2],
-        slender=True,
-    )
+    Ixx, Iyy, Izz = (totals - plate.inertia_kgm2).tolist()
+    products = (section.Ixy_load_kgm2, section.Ixz_load_kgm2, section.Iyz_load_kgm2)
+    load = Load(section.mass_kg, section.L7_m, section.L8_m, section.L9_m, Ixx, Iyy, Izz, *products)
+    field = "load.Ixx_total_kgm2 .. Iyz_load_kgm2"
+    _check_inertia(load.inertia(), field, [*totals, *products], slender=True)
     return load
 
 
@@ -322,7 +233,3 @@ def _same_length(section: str, content: dict[str, Any], keys: tuple[str, ...]) -
                 field=f"{section}.{key}",
                 value=content[key],
             )
-
-
-def _tuples(section: BaseModel) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in section.model_dump().items()}

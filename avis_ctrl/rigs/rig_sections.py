@@ -2,78 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+import re
+from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
-from avis_ctrl.rigs.converter import bits_of
-from avis_ctrl.rigs.equipment import Electronics
+from avis_ctrl.rigs.avis import Isolator
+from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.file_errors import Section
-from avis_ctrl.rigs.floor_spectrum import shipped_spectra
-from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, FloorSensor, GeophoneAt, PositionSensorAt, Tolerances
+from avis_ctrl.rigs.key_types import (
+    Axis,
+    Length,
+    NotNegative,
+    Number,
+    Point,
+    Positive,
+    PositiveLength,
+    PositiveVector,
+    Vector,
+)
 
 
-@dataclass(frozen=True)
-class RigLimits:
-    """farthest_m : maximum distance of a point from the origin along each axis [m]. No table is larger, and for distant
-        points the inertia is lost in the round-off of m r^2.
-    largest : maximum size of any number [SI unit of its key]: no value of a table comes near it, and products of such
-        numbers are finite.
-    """
-
-    farthest_m: float = 100.0
-    largest: float = 1e12
-
-
-LIMITS = RigLimits()
-Number = Annotated[float, Field(ge=-LIMITS.largest, le=LIMITS.largest)]
-Positive = Annotated[float, Field(gt=0, le=LIMITS.largest)]
-NotNegative = Annotated[float, Field(ge=0, le=LIMITS.largest)]
-
-
-def _not_far(length: float) -> float:
-    if abs(length) > LIMITS.farthest_m:
-        raise ValueError(f"expected a length in metres, at most {LIMITS.farthest_m:g}")
-    return length
-
-
-Length = Annotated[float, AfterValidator(_not_far)]
-PositiveLength = Annotated[float, Field(gt=0), AfterValidator(_not_far)]
-Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Point = Annotated[list[Length], Field(min_length=3, max_length=3)]
-PositiveVector = Annotated[list[Positive], Field(min_length=3, max_length=3)]
-DampingVector = Annotated[list[NotNegative], Field(min_length=3, max_length=3)]
-Axis = Literal["x", "y", "z"]
-
-
-def _with_a_length(direction: list[float]) -> list[float]:
-    if not any(direction):
-        raise ValueError("expected a vector that is not zero")
-    return direction
-
-
-Direction = Annotated[list[Number], Field(min_length=3, max_length=3), AfterValidator(_with_a_length)]
-# Channel names become signal names of models: letters, digits, _ and -, a letter first.
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")]
-Percent = Annotated[float, Field(ge=0, le=100)]
-
-
-def _rising(band: list[float]) -> list[float]:
-    if band[0] >= band[1]:
-        raise ValueError("expected the lower limit first, then the upper one")
-    return band
-
-
-def _shipped(spectrum: str) -> str:
-    if spectrum not in shipped_spectra():
-        raise ValueError(f"expected one of {', '.join(shipped_spectra())}")
-    return spectrum
-
-
-# Also for other files: a frequency band [Hz], and the name of a shipped spectrum of floor motion.
-Band = Annotated[list[Positive], Field(min_length=2, max_length=2), AfterValidator(_rising)]
-Spectrum = Annotated[str, AfterValidator(_shipped)]
+def symbol_of(key: str) -> str:
+    """The symbol of the source in a key of the Halcyonics table: the key without the unit of a length, a stiffness or a
+    damping ("k_a_N_per_m" is k_a)."""
+    return re.sub("_(m|N.*)$", "", key)
 
 
 class AvisPayload(Section):
@@ -81,17 +35,8 @@ class AvisPayload(Section):
 
     mass_kg: Positive
     inertia_kgm2: PositiveVector
-    inertia_offdiagonal_kgm2: Vector = [0.0, 0.0, 0.0]
+    inertia_offdiagonal_kgm2: Vector = (0.0, 0.0, 0.0)
     centre_of_mass_m: Point
-
-
-class IsolatorSection(Section):
-    """Spring and damper along the earth axes; chassis_point_m : position_m by default."""
-
-    position_m: Point
-    stiffness_N_per_m: PositiveVector
-    damping_Ns_per_m: DampingVector
-    chassis_point_m: Point | None = None
 
 
 class MotorSection(Section):
@@ -102,88 +47,6 @@ class MotorSection(Section):
     axis: list[Axis] = []
     constant_N_per_V: list[Positive] = []
     limit_V: Positive
-
-
-class PlacedSection(Section):
-    """A drive or sensor at any position."""
-
-    name: Name
-    position_m: Point
-    direction: Direction
-
-
-class DriveSection(PlacedSection):
-    """A drive at any position; limit_V : that of [actuators] by default."""
-
-    constant_N_per_V: Positive
-    limit_V: Positive | None = None
-
-
-class GeophoneSection(Section):
-    """Geophones in the isolators, along their axes."""
-
-    names: list[str]
-    isolator: list[int]
-    axis: list[Axis]
-    sensitivity_Vs_per_m: list[Positive]
-    suspension_Hz: Positive
-    suspension_damping: Positive
-    compensated_Hz: Positive
-    compensated_damping: Positive
-    preamplifier_gain: Positive
-
-
-class GeophoneAtSection(PlacedSection):
-    """A geophone at any position."""
-
-    sensitivity_Vs_per_m: Positive
-    suspension_Hz: Positive
-    suspension_damping: Positive
-    compensated_Hz: Positive | None = None
-    compensated_damping: Positive | None = None
-    preamplifier_gain: Positive = 1.0
-    noise_rms_V: NotNegative | None = None
-
-
-class AccelerometerAtSection(PlacedSection):
-    """An accelerometer at any position."""
-
-    sensitivity_Vs2_per_m: Positive
-    low_corner_Hz: Positive
-    noise_m_per_s2_rtHz: NotNegative | None = None
-    preamplifier_gain: Positive = 1.0
-    noise_rms_V: NotNegative | None = None
-
-
-class PositionSensorSection(PlacedSection):
-    """A position sensor, payload relative to chassis, at any position."""
-
-    sensitivity_V_per_m: Positive
-    bandwidth_Hz: Positive | None = None
-    noise_m_rtHz: NotNegative | None = None
-    preamplifier_gain: Positive = 1.0
-    noise_rms_V: NotNegative | None = None
-
-
-class FloorSensorSection(Section):
-    """A sensor of floor velocity along one axis."""
-
-    name: Name
-    axis: Axis
-    noise_rms_m_per_s: NotNegative
-
-
-class TolerancesSection(Section):
-    """Standard deviations; omitted keys take the default."""
-
-    place_m: NotNegative = Tolerances.place_m
-    direction_rad: NotNegative = Tolerances.direction_rad
-    actuator_gain_percent: Percent = Tolerances.actuator_gain_percent
-    sensor_gain_percent: Percent = Tolerances.sensor_gain_percent
-    sensor_corner_percent: Percent = Tolerances.sensor_corner_percent
-    sensor_damping_percent: Percent = Tolerances.sensor_damping_percent
-    centre_of_mass_m: NotNegative = Tolerances.centre_of_mass_m
-    product_of_inertia_kgm2: NotNegative = Tolerances.product_of_inertia_kgm2
 
 
 class ElectronicsSection(Section):
@@ -204,38 +67,22 @@ class ElectronicsSection(Section):
         return corner
 
 
-class AcquisitionSection(Section):
-    """Converter and timing of the controller."""
-
-    sample_rate_Hz: Positive
-    adc_bits: Annotated[int, BeforeValidator(bits_of)]
-    adc_range_V: Positive
-    loop_delay_s: NotNegative
-
-
-class AmbientSection(Section):
-    """R.m.s. of floor motion and sensor noise."""
-
-    floor_velocity_rms_m_per_s: NotNegative
-    sensor_noise_rms_V: NotNegative
-
-
 class AvisFile(Section):
     """A rig file of a payload on isolators."""
 
     name: str
     payload: AvisPayload
-    isolator: Annotated[list[IsolatorSection], Field(min_length=3)]
+    isolator: Annotated[list[Isolator], Field(min_length=3)]
     actuators: MotorSection | None = None
-    drive: list[DriveSection] = []
-    geophones: GeophoneSection | None = None
-    geophone: list[GeophoneAtSection] = []
-    accelerometer: list[AccelerometerAtSection] = []
-    position_sensor: list[PositionSensorSection] = []
-    floor_sensor: Annotated[list[FloorSensorSection], Field(max_length=3)] = []
-    acquisition: AcquisitionSection
-    ambient: AmbientSection | None = None
-    tolerances: TolerancesSection | None = None
+    drive: list[Drive] = []
+    geophones: Geophones | None = None
+    geophone: list[GeophoneAt] = []
+    accelerometer: list[AccelerometerAt] = []
+    position_sensor: list[PositionSensorAt] = []
+    floor_sensor: Annotated[list[FloorSensor], Field(max_length=3)] = []
+    acquisition: Acquisition
+    ambient: Ambient | None = None
+    tolerances: Tolerances | None = None
     electronics: ElectronicsSection = ElectronicsSection()
 
 
@@ -278,18 +125,6 @@ class VoiceCoilSection(Section):
     free_constant_N_per_V: Positive
 
 
-class AccelerometerSection(Section):
-    """Built-in accelerometers of the Halcyonics table, at these actuators."""
-
-    at: Annotated[list[str], Field(min_length=1)]
-    sensitivity_Vs2_per_m: Positive
-    low_corner_Hz: Positive
-    noise_m_per_s2_rtHz: NotNegative
-    sample_rate_Hz: Positive
-    loop_delay_s: NotNegative
-    drive_limit_V: Positive
-
-
 class LoadSection(Section):
     """A load on the plate; `_total` is the inertia of plate and load."""
 
@@ -312,8 +147,8 @@ class HalcyonicsFile(Section):
     payload: PlateSection
     suspension: SuspensionSection
     actuators: VoiceCoilSection
-    accelerometers: AccelerometerSection
+    accelerometers: Accelerometers
     load: LoadSection | None = None
-    ambient: AmbientSection | None = None
-    tolerances: TolerancesSection | None = None
+    ambient: Ambient | None = None
+    tolerances: Tolerances | None = None
     electronics: ElectronicsSection = ElectronicsSection()

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
 from avis_ctrl.rigs.equipment import Ambient, Electronics
+from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument, PositionSensorAt
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.rigs.rig_sections import LoadSection, PlateSection, SuspensionSection, symbol_of
 from avis_ctrl.rigs.toml_text import toml_value
 
 
@@ -28,6 +32,7 @@ class _Line:
 
 # Title as written in the file, name used in comments and messages, and lines.
 _Section = tuple[str, str, list[_Line]]
+_adapter = cache(TypeAdapter)
 _KINDS = {GeophoneAt: "geophone", AccelerometerAt: "accelerometer", PositionSensorAt: "position_sensor"}
 
 
@@ -117,15 +122,9 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
         ),
     ]
     for number, one in enumerate(rig.isolators, 1):
-
-        def of(kind: str, number: int = number) -> tuple[str, ...]:
-            return tuple(f"isolator{number}.{kind}_{axis}" for axis in AXES)
-
-        lines = [
-            _Line("position_m", one.position, of("p")),
-            _Line("stiffness_N_per_m", one.stiffness, of("k")),
-            _Line("damping_Ns_per_m", one.damping, of("c")),
-        ]
+        kinds = {"position_m": "p", "stiffness_N_per_m": "k", "damping_Ns_per_m": "c"}
+        lines = _all(one, {key: [f"isolator{number}.{kind}_{axis}" for axis in AXES] for key, kind in kinds.items()})
+        del lines[3:]  # the file has the point on the chassis, not relative to the attachment
         if any(one.chassis_offset):
             lines.append(_Line("chassis_point_m", _sum_for(one.chassis_offset, one.position)))
         sections.append(("[[isolator]]", f"isolator[{number}]", lines))
@@ -150,26 +149,19 @@ def _avis_sections(rig: AvisTable) -> list[_Section]:
     return sections + _ambient(rig.ambient) + _tolerances(rig)
 
 
-def _all(thing: Any) -> list[_Line]:
-    """Lines of all fields that have a value."""
-    return [_Line(one.name, value) for one in fields(thing) if (value := getattr(thing, one.name)) is not None]
+def _all(thing: Any, parameters: Mapping[str, Sequence[str]] = {}) -> list[_Line]:
+    """Lines of all fields that have a value; parameters : that the values contain, by key."""
+    adapter = _adapter(type(thing))  # type: ignore[arg-type]  # a type is hashable
+    content = adapter.dump_python(thing, by_alias=True, exclude_none=True)
+    last = {one.name for one in fields(thing) if one.kw_only}  # what all sensors have follows what each kind has
+    keys = sorted(content, key=lambda key: key in last)
+    return [_Line(key, content[key], tuple(parameters.get(key, ()))) for key in keys]
 
 
-def _at_place(thing: Drive | Instrument) -> list[_Line]:
-    held = {
-        "constant_N_per_V": (f"actuator.{thing.name}",),
-        "position": _along("place", thing),
-        "direction": _along("direction", thing),
-    }
-    return [
-        replace(line, key="position_m" if line.key == "position" else line.key, parameters=held.get(line.key, ()))
-        for line in _all(thing)
-        if line.key != "dependent"  # how a fit turns the direction; no property of the channel
-    ]
-
-
-def _along(kind: str, thing: Drive | Instrument) -> tuple[str, ...]:
-    return tuple(f"{kind}.{thing.name}.{axis}" for axis in AXES)
+def _at_place(one: Drive | Instrument) -> list[_Line]:
+    place, direction = ([f"{kind}.{one.name}.{axis}" for axis in AXES] for kind in ("place", "direction"))
+    force = [f"actuator.{one.name}"]
+    return _all(one, {"constant_N_per_V": force, "position_m": place, "direction": direction})
 
 
 def _tolerances(rig: Rig) -> list[_Section]:
@@ -180,17 +172,10 @@ def _tolerances(rig: Rig) -> list[_Section]:
 
 
 def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
-    lengths = ("L1", "L2", "L3", "L4_plus_L5", "L6", "M2_arm", "M3_arm")
-    suspension = {
-        "k_a": "N_per_m",
-        "k_t": "N_per_m",
-        "k_r": "Nm_per_rad",
-        "d1": "Ns_per_m",
-        "d3": "Ns_per_m",
-        "d4": "Nms_per_rad",
-        "d5": "Nms_per_rad",
-        "d6": "Nms_per_rad",
-    }
+    def of(model: type[Section], start: int) -> list[_Line]:
+        """Lines of the values that a section has as the table has them, from its key number `start` on."""
+        return [_Line(key, getattr(rig, symbol_of(key)), (symbol_of(key),)) for key in list(model.model_fields)[start:]]
+
     springs = [_Line("k_s_N_per_m", float(np.mean(rig.k_s)), ("k_s",))]
     if len(set(rig.k_s)) > 1:
         springs.append(_Line("k_s_each_N_per_m", rig.k_s, tuple(f"k_s{k}" for k in range(1, 5))))
@@ -204,14 +189,10 @@ def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
             [
                 _Line("mass_kg", rig.mass, ("mass",)),
                 _Line("inertia_kgm2", (rig.Ixx, rig.Iyy, rig.Izz), ("Ixx", "Iyy", "Izz")),
-                *(_Line(f"{name}_m", getattr(rig, name), (name,)) for name in lengths),
+                *of(PlateSection, 2),
             ],
         ),
-        (
-            "[suspension]",
-            "suspension",
-            springs + [_Line(f"{name}_{unit}", getattr(rig, name), (name,)) for name, unit in suspension.items()],
-        ),
+        ("[suspension]", "suspension", springs + of(SuspensionSection, 2)),
         (
             "[actuators]",
             "actuators",
@@ -226,24 +207,10 @@ def _halcyonics_sections(rig: Halcyonics) -> list[_Section]:
         ("[accelerometers]", "accelerometers", _all(rig.accelerometers)),
     ]
     if (load := rig.load) is not None:
-        moments = ("Ixx", "Iyy", "Izz")
         totals = _sum_for((load.Ixx, load.Iyy, load.Izz), (rig.Ixx, rig.Iyy, rig.Izz))
-        sections.append(
-            (
-                "[load]",
-                "load",
-                [
-                    _Line("mass_kg", load.mass, ("load.mass",)),
-                    *(_Line(f"{name}_m", getattr(load, name), (f"load.{name}",)) for name in ("L7", "L8", "L9")),
-                    *(
-                        _Line(f"{name}_total_kgm2", total, (f"load.{name}",))
-                        for name, total in zip(moments, totals, strict=True)
-                    ),
-                    *(
-                        _Line(f"{name}_load_kgm2", getattr(load, name), (f"load.{name}",))
-                        for name in ("Ixy", "Ixz", "Iyz")
-                    ),
-                ],
-            )
-        )
+        stated = replace(load, Ixx=totals[0], Iyy=totals[1], Izz=totals[2])
+        # The keys are in the order of the fields.
+        lines = zip(LoadSection.model_fields, fields(load), strict=True)
+        held = [_Line(key, getattr(stated, one.name), (f"load.{one.name}",)) for key, one in lines]
+        sections.append(("[load]", "load", held))
     return sections + _ambient(rig.ambient) + _tolerances(rig)

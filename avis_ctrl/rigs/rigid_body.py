@@ -21,6 +21,18 @@ COORDINATES = ("x", "y", "z", "phi_x", "phi_y", "phi_z")
 GRAVITY = 9.80665
 
 
+def freeze(thing: object, **shapes: tuple[int, ...]) -> None:
+    """Make fields of a frozen dataclass read-only float arrays. Raises InputError for another shape or numbers that
+    are not finite."""
+    for name, shape in shapes.items():
+        array = np.array(getattr(thing, name), dtype=float)
+        if array.shape != shape or not np.all(np.isfinite(array)):
+            shown = array.tolist() if array.size <= 9 else array.shape
+            raise InputError(f"expected finite numbers of shape {shape}", field=name, value=shown)
+        array.setflags(write=False)
+        object.__setattr__(thing, name, array)
+
+
 def cross_matrix(r: ArrayLike) -> np.ndarray:
     """S(r), (3, 3), with S(r) a = r x a."""
     x, y, z = np.asarray(r)
@@ -79,12 +91,7 @@ class EquationsOfMotion:
     def __post_init__(self) -> None:
         n, n_f, n_u = len(self.coordinates), len(self.floor_coordinates), len(self.actuators)
         shapes = {"M": (n, n), "C": (n, n), "K": (n, n), "C_floor": (n, n_f), "K_floor": (n, n_f), "T": (n, n_u)}
-        for name, shape in shapes.items():
-            matrix = np.array(getattr(self, name), dtype=float)
-            if matrix.shape != shape or not np.all(np.isfinite(matrix)):
-                raise InputError(f"expected a finite {shape} matrix", field=name, value=matrix.shape)
-            matrix.setflags(write=False)
-            object.__setattr__(self, name, matrix)
+        freeze(self, **shapes)
 
     def natural_frequencies(self) -> Modes:
         """Modes of the undamped system with the floor and the actuators at rest."""

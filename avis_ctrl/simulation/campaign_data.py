@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class CampaignSettings:
         rig as specified in its file. The rest is for ambient motion, noise and the table's differences from its file.
     assumed_range_V : range of the sensors if the rig file has no converter; used for the level only, without clipping.
     level_percent : level of a record whose plan states none: the highest level of the default plan.
-    amplifier_corner_Hz : corner of the amplifiers of rigs with accelerometers if none is stated, as in design files.
+    amplifier_corner_Hz : corner of the amplifiers if none is stated: of rigs with accelerometers, and in design files.
     most_samples, most_samples_in_all : limits of a record and of a campaign, from memory: a record takes about 600
         bytes per sample during its simulation, and 150 afterwards.
     """
@@ -212,25 +213,8 @@ def _drawn(
             field="duration_s",
             value=samples / fs,
         )
-    return multisine(
-        MultisineSettings(
-            names,
-            fs,
-            m.period_s,
-            (low, high),
-            limit_V,
-            None,
-            m.lines,
-            m.spacing,
-            m.group,
-            m.scheme,
-            one.records,
-            dealt,
-            m.compensate_hold,
-            m.low_crest,
-            seed,
-        )
-    )
+    own: dict[str, Any] = {"realisations": one.records, "dealt": dealt, "seed": seed, **m.model_dump()}
+    return multisine(MultisineSettings(names, fs, band_Hz=(low, high), limit_V=limit_V, **own))
 
 
 def _played(u: np.ndarray, samples: int) -> np.ndarray:
@@ -310,7 +294,9 @@ def _record(
     measured = None
     if plan.floor_sensor.recorded:
         draw = _rng(*seed, _FLOOR_SENSOR).standard_normal((samples, 3))
-        own = {one.axis: one.noise_rms_m_per_s for one in loop.rig.floor_sensors if plan.sensors.noise}
+        own: dict[str, float] = {
+            one.axis: one.noise_rms_m_per_s for one in loop.rig.floor_sensors if plan.sensors.noise
+        }
         rms = np.array([np.hypot(plan.floor_sensor.noise_rms_m_per_s, own.get(axis, 0.0)) for axis in "xyz"])
         measured = run.floor_dot[:, :3] + rms * draw
     return Record(header, run.demanded, y, measured), _levels(header, run, y)

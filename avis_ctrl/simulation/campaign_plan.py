@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from avis_ctrl.rigs.file_errors import Section
-from avis_ctrl.rigs.rig_sections import Band, NotNegative, Positive, Spectrum
+from avis_ctrl.rigs.key_types import Band, NotNegative, Positive, Spectrum
 
 Duration = Annotated[float, Field(gt=0, le=36000)]
 Percent = Annotated[float, Field(gt=0, le=100)]

@@ -65,21 +65,11 @@ class PlantCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file."""
-        return {
-            "name": self.name,
-            "passed": self.passed,
-            "stable": self.stable,
-            "diverged": self.diverged,
-            "spectral_radius": self.spectral_radius,
+        names = ("name", "passed", "stable", "diverged", "spectral_radius", "within_limits")
+        volts = ("peak_V", "rms_V", "limit_V", "clipped_dac", "clipped_adc")
+        return {name: getattr(self, name) for name in (*names, *volts, "payload_rms")} | {
             "spectrum_agrees": self.agrees,
             "spectrum": self.spectrum.as_dict() if self.spectrum else None,
-            "within_limits": self.within_limits,
-            "peak_V": self.peak_V,
-            "rms_V": self.rms_V,
-            "limit_V": self.limit_V,
-            "clipped_dac": self.clipped_dac,
-            "clipped_adc": self.clipped_adc,
-            "payload_rms": self.payload_rms,
         }
 
 

@@ -63,26 +63,34 @@ def workspace(arrays: StepArrays, state: np.ndarray, delay: int) -> Work:
     """Work arrays of a loop that starts in `state` with its controller at rest; delay in steps."""
     matrices = (arrays.advance, arrays.observe, arrays.sense, arrays.control)
     n_u = arrays.observe.shape[0] - 6
-    w, w_end, N, N_before = np.zeros((4, 6))
-    advance_in, observe_in, sense_in, control_in = (np.zeros(matrix.shape[1]) for matrix in matrices)
-    observed, sensed, controlled = (np.zeros(matrix.shape[0]) for matrix in matrices[1:])
-    return Work(
-        state,
-        np.zeros(n_u),
-        w,
-        w_end,
-        N,
-        N_before,
-        np.zeros((delay + 1, n_u)),
-        np.zeros(n_u),
-        advance_in,
-        observe_in,
-        sense_in,
-        control_in,
-        observed,
-        sensed,
-        controlled,
-    )
+    vectors = [state, np.zeros(n_u), *np.zeros((4, 6)), np.zeros((delay + 1, n_u)), np.zeros(n_u)]
+    vectors += [np.zeros(matrix.shape[1]) for matrix in matrices]
+    return Work(*vectors, *(np.zeros(matrix.shape[0]) for matrix in matrices[1:]))
+
+
+class Run(NamedTuple):
+    """A loop and the signals of its simulation.
+
+    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V added to the controller's.
+    substeps : steps per period. nonlinear : whether N is computed. acceleration : whether sensors measure it.
+    adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. windup : (keep, feed) of the
+        anti-windup.
+    far : (m, rad) distance from the floor beyond which the table has diverged.
+    """
+
+    arrays: StepArrays
+    work: Work
+    records: Records
+    floor: np.ndarray
+    noise: np.ndarray
+    drive: np.ndarray
+    substeps: int
+    nonlinear: bool
+    acceleration: bool
+    adc: np.ndarray
+    limit_V: np.ndarray
+    windup: AntiWindup
+    far: np.ndarray
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
@@ -194,108 +202,50 @@ def _gone(x: np.ndarray, far: np.ndarray) -> bool:
 
 
 @njit(cache=True)
-def _sample(
-    arrays: StepArrays,
-    work: Work,
-    floor: np.ndarray,
-    noise: np.ndarray,
-    k: int,
-    substeps: int,
-    first: bool,
-    adc: np.ndarray,
-    records: Records,
-) -> None:
-    """Start of period k: converter readings; first : whether the sensors measure N, which is then computed before."""
-    _arrive(work, floor, k, 0, substeps, k * substeps)
-    if first:
-        _excess(arrays, work)
-    _sense(arrays, work, noise[k], adc, records.sensed[k])
+def _sample(run: Run, k: int) -> None:
+    """Start of period k: converter readings. If the sensors measure N, it is computed before them."""
+    _arrive(run.work, run.floor, k, 0, run.substeps, k * run.substeps)
+    if run.nonlinear and run.acceleration:
+        _excess(run.arrays, run.work)
+    _sense(run.arrays, run.work, run.noise[k], run.adc, run.records.sensed[k])
 
 
 @njit(cache=True)
-def _period(
-    arrays: StepArrays,
-    work: Work,
-    floor: np.ndarray,
-    drive: np.ndarray,
-    k: int,
-    substeps: int,
-    nonlinear: bool,
-    acceleration: bool,
-    limit_V: np.ndarray,
-    windup: AntiWindup,
-    records: Records,
-) -> None:
-    """The remainder of period k, with the controller's voltages for its sample."""
-    _demand(work, k * substeps, drive[k], limit_V, windup, records.demanded[k])
+def _period(run: Run, k: int) -> bool:
+    """The remainder of period k, with the voltages for its sample; whether the table has left its range."""
+    work, records, substeps = run.work, run.records, run.substeps
+    _demand(work, k * substeps, run.drive[k], run.limit_V, run.windup, records.demanded[k])
     _put(records.volts[k], 0, work.u)
     _put(records.q[k], 0, work.x[:6])
     _put(records.q_dot[k], 0, work.x[6:12])
     for j in range(substeps):
         if j > 0:
-            _arrive(work, floor, k, j, substeps, k * substeps + j)
-        if nonlinear and (j > 0 or not acceleration):
-            _excess(arrays, work)
+            _arrive(work, run.floor, k, j, substeps, k * substeps + j)
+        if run.nonlinear and (j > 0 or not run.acceleration):
+            _excess(run.arrays, work)
         if k == 0 and j == 0:
             _put(work.N_before, 0, work.N)
-        _advance(arrays, work)
+        _advance(run.arrays, work)
+    return _gone(work.x, run.far)
 
 
 @njit(cache=True)
-def run(
-    arrays: StepArrays,
-    work: Work,
-    floor: np.ndarray,
-    noise: np.ndarray,
-    drive: np.ndarray,
-    substeps: int,
-    nonlinear: bool,
-    acceleration: bool,
-    adc: np.ndarray,
-    limit_V: np.ndarray,
-    windup: AntiWindup,
-    far: np.ndarray,
-    records: Records,
-) -> int:
-    """Step through the control periods; return how many were completed before the table left its range, or all.
-
-    floor : (n + 1, 6) floor velocity at the samples; noise : (n, n_s) V; drive : (n, n_u) V added to the controller's.
-    substeps : steps per period. nonlinear : whether N is computed. acceleration : whether sensors measure it.
-    adc : (lsb, lower, upper) V, lsb = 0 for none. limit_V : (n_u,) of the drives. windup : (keep, feed) of the
-        anti-windup.
-    far : (m, rad) distance from the floor beyond which the table has diverged.
-    """
-    for k in range(floor.shape[0] - 1):
-        _sample(arrays, work, floor, noise, k, substeps, nonlinear and acceleration, adc, records)
-        _control(arrays, work)
-        _period(arrays, work, floor, drive, k, substeps, nonlinear, acceleration, limit_V, windup, records)
-        if _gone(work.x, far):
+def simulated(run: Run) -> int:
+    """Step through the control periods; return how many were completed before the table left its range, or all."""
+    for k in range(run.noise.shape[0]):
+        _sample(run, k)
+        _control(run.arrays, run.work)
+        if _period(run, k):
             return k + 1
-    return floor.shape[0] - 1
+    return run.noise.shape[0]
 
 
-def run_stepwise(
-    code: Callable[[np.ndarray], np.ndarray],
-    arrays: StepArrays,
-    work: Work,
-    floor: np.ndarray,
-    noise: np.ndarray,
-    drive: np.ndarray,
-    substeps: int,
-    nonlinear: bool,
-    acceleration: bool,
-    adc: np.ndarray,
-    limit_V: np.ndarray,
-    windup: AntiWindup,
-    far: np.ndarray,
-    records: Records,
-) -> int:
-    """`run` with a controller called once per sample, which does its own anti-windup: code (n_s,) -> (n_u,) volts."""
-    n_s, n_u = work.sensed.shape[0], work.u.shape[0]
-    for k in range(floor.shape[0] - 1):
-        _sample(arrays, work, floor, noise, k, substeps, nonlinear and acceleration, adc, records)
-        work.controlled[work.controlled.shape[0] - n_u :] = code(work.control_in[-n_s:])
-        _period(arrays, work, floor, drive, k, substeps, nonlinear, acceleration, limit_V, windup, records)
-        if _gone(work.x, far):
+def simulated_stepwise(run: Run, code: Callable[[np.ndarray], np.ndarray]) -> int:
+    """`simulated` with a controller called once per sample, with its own anti-windup: code (n_s,) -> (n_u,) volts."""
+    n_s, n_u = run.work.sensed.shape[0], run.work.u.shape[0]
+    for k in range(len(run.noise)):
+        _sample(run, k)
+        run.work.controlled[run.work.controlled.shape[0] - n_u :] = code(run.work.control_in[-n_s:])
+        if _period(run, k):
             return k + 1
-    return floor.shape[0] - 1
+    return len(run.noise)

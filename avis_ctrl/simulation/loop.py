@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -160,12 +160,10 @@ def simulate(
     if rest is not None:
         work.u[:] = np.clip(rest.volts, -loop.limits_V, loop.limits_V)
         work.control_in[: rest.controller.size] = rest.controller
-    run = kernel.run if code is None else partial(kernel.run_stepwise, code)
-    # `code` does its own anti-windup.
-    windup = loop.anti_windup if code is None else NO_ANTI_WINDUP
-    done = run(
+    run = kernel.Run(
         arrays,
         work,
+        records,
         floor,
         noise,
         drive,
@@ -174,10 +172,10 @@ def simulate(
         "acceleration" in loop.sensors.quantities,
         adc,
         loop.limits_V,
-        windup,
+        loop.anti_windup if code is None else NO_ANTI_WINDUP,  # `code` does its own
         np.array([SETTINGS.stop_m, SETTINGS.stop_rad]),
-        records,
     )
+    done = kernel.simulated(run) if code is None else kernel.simulated_stepwise(run, code)
     kept = slice(min(settle, done - 1), done)
     q, q_dot, volts, demanded, sensed = (record[kept].copy() for record in records)
     time = (np.arange(samples)[kept] - settle) * loop.period_s

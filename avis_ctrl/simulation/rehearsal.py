@@ -14,7 +14,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.avis import INERTIA, AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
-from avis_ctrl.rigs.instruments import Triple, triple, unit_vector
+from avis_ctrl.rigs.instruments import Triple, triple
+from avis_ctrl.rigs.key_types import unit_vector
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -154,7 +155,7 @@ def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
     def placed(position: Triple, direction: Triple) -> dict[str, Triple]:
         moved = np.add(position, t.place_m * rng.standard_normal(3))
         turned = direction + np.cross(t.direction_rad * rng.standard_normal(3), direction)
-        return {"position": triple(moved), "direction": unit_vector(triple(turned), "direction")}
+        return {"position": triple(moved), "direction": unit_vector(triple(turned))}
 
     def moved_along(one: Any) -> Any:
         return replace(one, **placed(one.position, one.direction))

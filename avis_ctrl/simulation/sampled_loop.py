@@ -95,15 +95,11 @@ def rig_bank(rig: Rig, integrator_corner_Hz: float) -> SensorBank:
     sensors, filters = rig.sensors(), conditioning(rig, integrator_corner_Hz)
     systems = {one: None if one.is_one else one.system() for one in filters}
     # Identical sensors share one chain object.
-    chains = {
-        one: one.chain()
-        for one in dict.fromkeys(
-            replace(each, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)) for each in sensors
-        )
-    }
+    kinds = [replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0)) for one in sensors]
+    chains = {one: one.chain() for one in dict.fromkeys(kinds)}
     return SensorBank(
         tuple(one.quantity for one in sensors),
-        tuple(chains[replace(one, name="", position=(0.0, 0.0, 0.0), direction=(0.0, 0.0, 1.0))] for one in sensors),
+        tuple(chains[one] for one in kinds),
         np.array([one.gain for one in sensors]),
         np.array([one.noise_rms_V for one in sensors]),
         tuple(systems[one] for one in filters),

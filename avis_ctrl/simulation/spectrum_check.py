@@ -88,11 +88,7 @@ class SpectrumAgreement:
         """Values for a file."""
         return {
             "axes": list(self.axes),
-            "midband_Hz": self.midband_Hz.tolist(),
-            "ratio": self.ratio.tolist(),
-            "lower": self.lower.tolist(),
-            "upper": self.upper.tolist(),
-            "dof": self.dof.tolist(),
+            **{name: getattr(self, name).tolist() for name in ("midband_Hz", "ratio", "lower", "upper", "dof")},
             "outside": int(np.count_nonzero(self.outside)),
             "bands": int(self.ratio.size),
             "false_alarm": self.false_alarm,

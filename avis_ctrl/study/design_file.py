@@ -16,9 +16,11 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_serializer, fi
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import Section, read_toml, validated
+from avis_ctrl.rigs.key_types import LIMITS, Band, NotNegative, Positive, Spectrum
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import SHIPPED, load_rig
-from avis_ctrl.rigs.rig_sections import LIMITS, Band, ElectronicsSection, NotNegative, Positive, Spectrum
+from avis_ctrl.rigs.rig_sections import ElectronicsSection
+from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
 from avis_ctrl.study.uncertainty_file import UncertaintyFile, read_uncertainty
 from avis_ctrl.uncertainty.uncertain_rig import UncertainParameter
 
@@ -38,7 +40,7 @@ Rival = Literal["hinf", "skyhook_classical", "skyhook", "loops"]
 class LoopSection(Section):
     """Dynamics between the controller and the rig that the rig file does not contain."""
 
-    amplifier_corner_Hz: Positive = 300.0
+    amplifier_corner_Hz: Positive = CAMPAIGN.amplifier_corner_Hz
     integrator_corner_Hz: Positive = 0.1
     pade_order: Annotated[int, Field(ge=1, le=6)] = 2
 

@@ -13,10 +13,10 @@ import numpy as np
 from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
+from avis_ctrl.rigs.key_types import LIMITS
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
-from avis_ctrl.rigs.rig_sections import LIMITS
 from avis_ctrl.study.design_file import Design, design_from_table
 from avis_ctrl.study.identification_design import default_design, design_toml
 

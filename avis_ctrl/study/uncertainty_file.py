@@ -19,8 +19,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.spread import FrfSpread
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
+from avis_ctrl.rigs.key_types import NotNegative, Number, Positive
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.rig_sections import NotNegative, Number, Positive
 from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread
 
 

@@ -3,13 +3,12 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import get_args
 
-from pydantic import BaseModel
-
+from avis_ctrl.rigs.file_errors import keys_of, section_in
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_sections import AvisFile, HalcyonicsFile
 from avis_ctrl.study.design_file import Design, design_from_table
+from avis_ctrl.study.uncertainty_file import UncertaintyFile
 
 DOCS = Path(__file__).parents[2] / "docs"
 # "## Isolators: `[payload]`" or "## `[[requirement]]`, a line of ..."
@@ -34,20 +33,16 @@ def listed(text, kinds):
 def keys(model, prefix="", top=True):
     """Keys by section, out of the reader's models; sections inside sections by their dotted name."""
     found, own = {}, set()
-    for name, field in model.model_fields.items():
-        inner = section_of(field.annotation)
+    for name, annotation in keys_of(model).items():
+        inner = section_in(annotation)
+        if inner is UncertaintyFile:
+            inner = None
         if inner is None:
             own.add(name)
         else:
             own |= {name} if top else set()
             found |= keys(inner, f"{prefix}{name}.", top=False)
     return {prefix.rstrip("."): own} | found
-
-
-def section_of(annotation):
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation if annotation.__name__ != "UncertaintyFile" else None
-    return next((found for part in get_args(annotation) if (found := section_of(part))), None)
 
 
 def test_the_page_on_rig_files_lists_every_key():
