@@ -41,7 +41,6 @@ NO_TUNING = {
     "PRODUCTS",
     "RAYLEIGH",
     "RELEASED",
-    "REST",
     "SETTINGS",
     "SLOW",
     "SWEEP",
