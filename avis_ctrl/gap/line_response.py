@@ -104,7 +104,7 @@ class LineResponse:
         for part in self.parts:
             here = slice(start, start := start + len(part.ops.omega))
             response = TableResponse(
-                part, Acting(U[here, :, None], reading=None if beside is None else beside[here, :, None])
+                part, Acting(U[here, :, None], u.shape[1], reading=None if beside is None else beside[here, :, None])
             )
             x = response.x if moved is None else response.x + moved[here, :, None]
             Y.append(response.read(x)[:, :, 0])

@@ -320,7 +320,7 @@ class TableModel(Table):
     def acting(self, U: np.ndarray, block: SpectralBlock | None, inner: np.ndarray | None = None) -> Acting:
         """Inputs with the acting volts, and the contributions of effects that depend on the record."""
         if block is None:
-            return Acting(U, inner=inner)
+            return Acting(U, len(self.actuators), inner=inner)
         record = self.motion.get(block.name)
         if record is None:
             raise InputError(
@@ -331,7 +331,7 @@ class TableModel(Table):
         if volts is not None:
             U = U.copy()
             U[:, : len(self.actuators)] += volts
-        return Acting(U, force, reading, output, inner)
+        return Acting(U, len(self.actuators), force, reading, output, inner)
 
     def _by_effects(
         self, omega: np.ndarray, block: SpectralBlock | None, made: Assembled, response: TableResponse, dY: np.ndarray
@@ -351,7 +351,7 @@ class TableModel(Table):
                 change = np.zeros((len(omega), len(self.inputs), 1), complex)
                 if volts is not None:
                     change[:, : len(self.actuators)] = volts
-                side = AtMotion(made, Acting(change, *rest), np.zeros_like(response.x))
+                side = AtMotion(made, Acting(change, len(self.actuators), *rest), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
             sides = [AtMotion(table, response.acting, response.x) for table in tables]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,15 +18,26 @@ MOUNT = re.compile(r"isolator(\d+)\.([kc])_([xyz])")
 
 @dataclass(frozen=True, eq=False)
 class Acting:
-    """Inputs of the table: U (n, n_u + 3 [+ 12], m), internal force (n, 6, m), displacement (n, n_y, m) that the
-    sensors read in addition to the payload's, additional sensor output (n, n_y, m), and initial internal states
-    (`TableModel.inner_transients`)."""
+    """Inputs of the table: U (n, n_u + 3 [+ 12], m) with the volts of n_u drives first, internal force (n, 6, m),
+    displacement (n, n_y, m) that the sensors read in addition to the payload's, additional sensor output (n, n_y, m),
+    and initial internal states (`TableModel.inner_transients`)."""
 
     U: np.ndarray
+    n_u: int
     force: np.ndarray | None = None
     reading: np.ndarray | None = None
     output: np.ndarray | None = None
     inner: np.ndarray | None = None
+
+    @cached_property
+    def driven(self) -> bool:
+        """Whether there are volts."""
+        return bool(self.U[:, : self.n_u].any())
+
+    @cached_property
+    def floor_moves(self) -> bool:
+        """Whether there is floor motion."""
+        return bool(self.U[:, self.n_u : self.n_u + 3].any())
 
 
 class DrivenTable:
@@ -33,15 +45,15 @@ class DrivenTable:
 
     def __init__(self, made: Assembled, acting: Acting):
         self.made, self.acting, self.gain = made, acting, made.gain
-        U, ops, n_u = acting.U, made.ops, len(made.ops.base.actuators)
+        U, ops, n_u = acting.U, made.ops, acting.n_u
         self.s = s = ops.s[:, None, None]
         commanded = U[:, :n_u]
         self.volts = made.volts[:, :, None] * commanded
         self.w = U[:, n_u : n_u + 3] / s
         self.folded, self.alias = commanded * ops.drive[:, :, None], made.folded[:, :, None]
-        self.sense, self.is_driven = ops.sense[:, :, None], bool(np.any(self.folded))
-        total = made.T @ self.volts if self.is_driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
-        if np.any(self.w):
+        self.sense = ops.sense[:, :, None]
+        total = made.T @ self.volts if acting.driven else np.zeros((len(s), made.n_q, U.shape[2]), complex)
+        if acting.floor_moves:
             total = total + made.floor_force(self.w)
         if U.shape[1] > n_u + 3:
             total[:, :N_Q] += U[:, n_u + 3 : n_u + 3 + N_Q] + s * U[:, n_u + 3 + N_Q :]
@@ -53,15 +65,15 @@ class DrivenTable:
 
     def read(self, x: np.ndarray) -> np.ndarray:
         """(n, n_y, m) sensor outputs for a motion x; aliases pass the chain far above its corners."""
-        mat = self.made.ops.base.matrices
+        base = self.made.ops.base
         moved = self.made.rows @ x
-        if np.any(against := self.made.ops.base.sensors.relative):
-            moved = moved - (against[:, None] * mat.R) @ self.made.chassis(x, self.w)
+        if np.any(against := base.sensors.relative):
+            moved = moved - (against[:, None] * base.matrices.R) @ self.made.chassis(x, self.w)
         if self.acting.reading is not None:
             moved = moved + self.acting.reading
         output = self.sense * moved
-        if self.is_driven:
-            output += self.alias * ((mat.R @ np.linalg.inv(mat.M) @ mat.T) @ self.folded)
+        if self.acting.driven:
+            output += self.alias * (base.accelerance @ self.folded)
         Y = self.gain * output
         return Y if self.acting.output is None else Y + self.acting.output
 
@@ -118,14 +130,12 @@ class TableResponse(DrivenTable):
             self.Y,
         )
         dY = operands.derivative(model.names, d, more)
-        if AMPLIFIERS in model.names and self.is_driven and ops.amplifier_corner_Hz is not None:
+        if AMPLIFIERS in model.names and self.acting.driven and ops.amplifier_corner_Hz is not None:
             # The effect actuator_lag adds to the time constant.
             driven = replace(model, delay_s=ops.delay_s, amplifier_corner_Hz=ops.amplifier_corner_Hz)
             slope, folded = driven.drive_slopes(ops.omega, AMPLIFIERS)
-            mat = model.matrices
-            dY[model.names.index(AMPLIFIERS)] = per_force @ (made.T @ (slope * self.folded)) + self.gain * folded * (
-                mat.R @ np.linalg.inv(mat.M) @ mat.T @ self.folded
-            )
+            by_force, aliased = made.T @ (slope * self.folded), model.accelerance @ self.folded
+            dY[model.names.index(AMPLIFIERS)] = per_force @ by_force + self.gain * folded * aliased
         moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         for kind in "kc":

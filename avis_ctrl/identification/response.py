@@ -585,6 +585,12 @@ class ResponseModel:
         """Matrices of the rig, with the actuators and sensors of the model."""
         return self.matrices_of(self.rig)
 
+    @cached_property
+    def accelerance(self) -> np.ndarray:
+        """(n_y, n_u) acceleration along the sensors per volt far above the resonances of the suspension, R inv(M) T."""
+        mat = self.matrices
+        return mat.R @ np.linalg.solve(mat.M, mat.T)
+
     def matrices_of(self, rig: Rig) -> Matrices:
         """Matrices of the given rig, with the actuators and sensors of the model."""
         eom = rig.equations_of_motion()
