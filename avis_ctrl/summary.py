@@ -57,6 +57,16 @@ def count_of(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def joined(words: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else list(words))
+
+
+def percent(fraction: float) -> str:
+    """A fraction in per cent, three digits."""
+    return f"{100 * fraction:.3g} %"
+
+
 def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = (), title: str = "") -> str:
     """A plain HTML table; everything is escaped."""
 

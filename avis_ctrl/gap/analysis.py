@@ -41,6 +41,7 @@ from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, f
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
+from avis_ctrl.summary import percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,10 +457,6 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
     return tuple(sorted(rows, key=lambda one: -one.probability)[: settings.shown_runners_up])
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"
-
-
 def _opening(
     verdict: Verdict,
     reported: Sequence[NamedEffect],
@@ -470,22 +467,22 @@ def _opening(
 ) -> str:
     """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
-    rest = f"the noise alone is estimated at {_percent(after.noise_nrmse)}"
+    rest = f"the noise alone is estimated at {percent(after.noise_nrmse)}"
     also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
     if verdict == "none":
         return (
             f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
-            f"{_percent(residual.nrmse)}; {rest}.{also}"
+            f"{percent(residual.nrmse)}; {rest}.{also}"
         )
     if verdict == "unexplained":
         return (
             f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
-            f"error on held-out records is {_percent(residual.nrmse)}; {rest}.{also}"
+            f"error on held-out records is {percent(residual.nrmse)}; {rest}.{also}"
         )
     lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
     return (
-        f"{missed(reported)} With this and all tolerances fitted, the gap falls from {_percent(before)} to "
-        f"{_percent(residual.nrmse)}{lines}; {rest}.{also}"
+        f"{missed(reported)} With this and all tolerances fitted, the gap falls from {percent(before)} to "
+        f"{percent(residual.nrmse)}{lines}; {rest}.{also}"
     )
 
 
@@ -508,7 +505,7 @@ def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
         else ""
     )
     return (
-        f"the residual is {_percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
-        f"noise{lies}; its power beyond noise is {_percent(residual.share)} of that of the re-identified "
+        f"the residual is {percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
+        f"noise{lies}; its power beyond noise is {percent(residual.share)} of that of the re-identified "
         f"model{level}"
     )

@@ -17,13 +17,13 @@ from avis_ctrl.identification.campaign_fit import (
     measured_noise,
     of_one_level,
 )
-from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.identification.maximum_likelihood import Residual
 from avis_ctrl.identification.noise import noise_from_residuals
 from avis_ctrl.identification.prediction_error import prediction_error
 from avis_ctrl.identification.spectra import record_block
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordSource
+from avis_ctrl.summary import joined
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def divide(campaign: Campaign) -> Halves:
         return Halves(
             campaign.only(rest),
             campaign.only(tuple(sorted(chosen))),
-            f"record{'s' * (len(chosen) > 1)} {listed(sorted(chosen))} (for each of them, another record of the same "
+            f"record{'s' * (len(chosen) > 1)} {joined(sorted(chosen))} (for each of them, another record of the same "
             "level is fitted)",
         )
     parts = [_parted(record) for record in driven]

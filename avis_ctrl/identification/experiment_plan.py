@@ -11,10 +11,11 @@ import scipy.linalg
 
 from avis_ctrl.identification.experiments import Added, Drive, Noise, changed, predicted_information
 from avis_ctrl.identification.identifiability import identifiability_report
-from avis_ctrl.identification.identifiability_text import combination_text, listed
+from avis_ctrl.identification.identifiability_text import combination_text
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
 from avis_ctrl.identification.structure import structural_null_space, structure_of
+from avis_ctrl.summary import joined
 
 CAUTION = (
     "These predictions include noise only: added masses, changed positions and added channels count as exactly "
@@ -88,7 +89,7 @@ class Outcome:
         if len(self.alone) > 6:
             worst = 100 * max(self.alone.values())
             shown.append(f"{len(self.alone) - 6} more parameters (the worst to {worst:.3g} %)")
-        return f"{said}, so that these parameters are determined individually: {listed(shown)}."
+        return f"{said}, so that these parameters are determined individually: {joined(shown)}."
 
 
 Predictions = list[tuple[Experiment, Information]]
@@ -134,7 +135,7 @@ def _changes(model: ResponseModel) -> dict[str, dict[str, Any]]:
         for picked in ([1], [1, 3]):
             shifts = {f"isolator{i}.p_{axis}": 0.05 for i in picked}
             if shifts.keys() <= model.rig.parameters().keys():
-                who = f"isolator{'s' if len(picked) > 1 else ''} {listed([str(i) for i in picked])}"
+                who = f"isolator{'s' if len(picked) > 1 else ''} {joined([str(i) for i in picked])}"
                 how = "raised by 50 mm" if axis == "z" else f"moved by 50 mm along {axis}"
                 found[f"{once} {who} {how}, with the motors and sensors in it"] = {"shifts": shifts}
     for axis, direction in {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}.items():
@@ -153,7 +154,7 @@ def _bench(model: ResponseModel) -> dict[str, dict[str, float]]:
     mounts = [name for name in picked if name.rpartition(".")[2].startswith(("k_", "c_"))]
     found = {}
     if mounts:
-        words = f"Measure single mounts on a bench, to {100 * SETTINGS.bench:.3g} % each: {listed(mounts)}"
+        words = f"Measure single mounts on a bench, to {100 * SETTINGS.bench:.3g} % each: {joined(mounts)}"
         found[words] = dict.fromkeys(mounts, SETTINGS.bench)
     if "mass" in model.names:
         found["Weigh the payload to 0.5 %"] = {"mass": 0.005}

@@ -9,6 +9,7 @@ import numpy as np
 from avis_ctrl import uncertain_value
 from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.structure import Scaling
+from avis_ctrl.summary import joined
 
 _KINDS = {
     "sensor": "sensor sensitivities",
@@ -21,11 +22,6 @@ _KINDS = {
     "N/V": "force constants",
     "m": "lengths",
 }
-
-
-def listed(words: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
 def combination_text(terms: Iterable[tuple[str, float]], powers: Sequence[tuple[str, float]] = ()) -> str:
@@ -67,10 +63,10 @@ def group_sentence(members: Sequence[str], seen: Sequence[Combination]) -> str:
     if not seen:
         one = len(members) == 1
         return (
-            f"{listed(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
+            f"{joined(members)} {'has' if one else 'have'} no influence on the responses to these inputs and "
             f"{'is' if one else 'are'} not determined."
         )
-    few = listed(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
+    few = joined(members) if len(members) <= 8 else f"{', '.join(members[:7])} and {len(members) - 7} more"
     if len(seen) == 1:
         plain = seen[0].words.removeprefix("(").partition(")")[0] == " + ".join(members)
         sort = "their sum" if plain else "one combination"
@@ -103,7 +99,7 @@ def kinds(exponents: np.ndarray, information: Information, of: float) -> list[st
 def scaling_sentence(scaling: Scaling, information: Information) -> str:
     """A common factor that changes no response, and the parameter that fixes it."""
     sizes = sorted(set(scaling.exponents[scaling.exponents != 0].tolist()), reverse=True)
-    members = [listed(kinds(scaling.exponents, information, size)) for size in sizes]
+    members = [joined(kinds(scaling.exponents, information, size)) for size in sizes]
     if sizes == [1.0]:
         said = f"{_upper(members[0])} are determined only as ratios: a common factor of all of them changes no response"
     elif sizes == [1.0, -1.0]:
@@ -135,4 +131,4 @@ def main_members(names: Sequence[str], direction: np.ndarray) -> list[tuple[str,
 def weak_direction_sentence(names: Sequence[str], direction: np.ndarray, sigma: float) -> str:
     """Changes of the parameters that amount to one standard deviation along the least precise direction."""
     moved = [f"{name} by {100 * sigma * weight:+.2g} %" for name, weight in main_members(names, direction)[:6]]
-    return f"The least precise combination: changing {listed(moved)} together is one standard deviation."
+    return f"The least precise combination: changing {joined(moved)} together is one standard deviation."

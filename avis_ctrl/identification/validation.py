@@ -27,6 +27,7 @@ from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.whiteness import Whiteness, whiteness
 from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
+from avis_ctrl.summary import percent
 
 
 @dataclass(frozen=True)
@@ -410,9 +411,9 @@ def verdict_of(figures: list[HeldOut]) -> str:
     else:
         judged = "the identified model agrees with the held-out data"
     return (
-        f"{judged}: on record {worst.name} its residual is {_percent(worst.nrms_all)} of the signal, r.m.s. "
-        f"(expected from noise alone {_percent(worst.nrms_all_interval[0])} to "
-        f"{_percent(worst.nrms_all_interval[1])}; start model {_percent(worst.nrms_all_start)}), and chi-square "
+        f"{judged}: on record {worst.name} its residual is {percent(worst.nrms_all)} of the signal, r.m.s. "
+        f"(expected from noise alone {percent(worst.nrms_all_interval[0])} to "
+        f"{percent(worst.nrms_all_interval[1])}; start model {percent(worst.nrms_all_start)}), and chi-square "
         f"per degree of freedom is {worst.chi2_per_dof:.4g} (expected {worst.chi2_interval[0]:.4g} to "
         f"{worst.chi2_interval[1]:.4g})"
     )
@@ -424,14 +425,14 @@ def _sentences(figures: list[HeldOut]) -> list[str]:
         if one.nrms_time is not None and one.nrms_time_start is not None:
             said.append(
                 f"record {one.name} {one.time_note}: normalised r.m.s. error in the band "
-                f"{_percent(one.nrms_time.min())} to {_percent(one.nrms_time.max())}, depending on the output "
-                f"(start model: {_percent(one.nrms_time_start.min())} to "
-                f"{_percent(one.nrms_time_start.max())})"
+                f"{percent(one.nrms_time.min())} to {percent(one.nrms_time.max())}, depending on the output "
+                f"(start model: {percent(one.nrms_time_start.min())} to "
+                f"{percent(one.nrms_time_start.max())})"
             )
         if one.nrms_all_exact is not None:
             said.append(
-                f"record {one.name}: residual {_percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
-                f"values of the rig file taken as exact, and {_percent(one.nrms_all)} with them fitted within "
+                f"record {one.name}: residual {percent(one.nrms_all_exact)} of the signal, r.m.s., with the "
+                f"values of the rig file taken as exact, and {percent(one.nrms_all)} with them fitted within "
                 "their tolerances"
             )
         if one.whiteness is not None:
@@ -454,7 +455,3 @@ def _mode_sentence(modes: tuple[ModeRow, ...]) -> list[str]:
         f"model and measured modes differ by at most {sigma:.2g} standard deviations, in the {what} of the mode at "
         f"{mode:.4g} Hz"
     ]
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %"

@@ -16,8 +16,9 @@ from avis_ctrl.report.sections.site import site
 from avis_ctrl.report.sections.synthesis import synthesis
 from avis_ctrl.report.sections.transmissibility import transmissibility
 from avis_ctrl.report.sections.verdict import comparison, verdict
-from avis_ctrl.report.words import axis, joined
+from avis_ctrl.report.words import axis
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.summary import joined
 
 SECTIONS: tuple[Callable[[DesignResult], Section], ...] = (
     verdict,

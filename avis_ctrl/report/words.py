@@ -111,8 +111,3 @@ def sentence(text: str) -> str:
     first = text.partition(" ")[0].rstrip(":;,.")
     text = text if "_" in first else text[:1].upper() + text[1:]
     return text if not text or text.endswith((".", "!", "?")) else f"{text}."
-
-
-def joined(names: list[str] | tuple[str, ...]) -> str:
-    """Names as "a, b and c"."""
-    return " and ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else list(names))

@@ -13,6 +13,7 @@ from avis_ctrl.lti.statespace import StateSpace, gain
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.discrete import period_map, spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms
+from avis_ctrl.summary import joined
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,12 @@ class Culprit:
         at = f'(plant "{self.plant}", spectral radius {self.radius:.6f})'
         if self.kind == "nonlinear":
             return f"the nonlinear simulation diverges although the linear loop is stable {at}"
+        along = joined(self.axes) or "no axis"
         how = (
-            f"a motion at {self.frequency_Hz:.3g} Hz, mainly along {_joined(self.axes)}, grows with a time constant "
+            f"a motion at {self.frequency_Hz:.3g} Hz, mainly along {along}, grows with a time constant "
             f"of {1 / max(self.growth_per_s, 1e-12):.3g} s {at}"
         )
-        loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {_joined(self.loops)}"
+        loops = f"the skyhook loop{'s' if len(self.loops) > 1 else ''} of {joined(self.loops)}"
         without = f"without {'these loops' if len(self.loops) > 1 else 'that loop'} this plant is stable"
         who = {
             "table": "the table is unstable even without control",
@@ -95,7 +97,3 @@ def _who(loop: SampledLoop) -> tuple[str, tuple[str, ...]]:
         (),
     )
     return ("companions" if not stable(idle, names) else "together"), fewest
-
-
-def _joined(names: tuple[str, ...]) -> str:
-    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "no axis"

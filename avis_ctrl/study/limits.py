@@ -14,7 +14,6 @@ from functools import partial
 import numpy as np
 
 from avis_ctrl.errors import ComputationError
-from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.robust.hinfsyn import hinf_suboptimal, hinfsyn
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
@@ -22,6 +21,7 @@ from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.summary import joined
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 
@@ -79,10 +79,10 @@ def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
             f"peaks at {_hertz(_peak(rest))}."
         )
         others = [f"the {name} (mu at most {_up(value):g} without it)" for value, name in bounds[1:]]
-        text += f" Also limiting: {listed(others)}." if others else ""
+        text += f" Also limiting: {joined(others)}." if others else ""
     if shares:
         named = [f"{name} (mu at most {_up(value):g} without it)" for value, name in shares[: SETTINGS.most]]
-        text += f" The largest contributions of uncertainties there: {listed(named)}."
+        text += f" The largest contributions of uncertainties there: {joined(named)}."
     if not bounds and not shares:
         return (
             f"{text} No single bound or uncertainty is limiting there: without any one of them, mu falls by less than "
@@ -206,7 +206,7 @@ def _least_dB(met: Callable[[float], bool]) -> float | None:
 def _enough(said: str, ways: list[str]) -> str:
     if not ways:
         return f"No single bound, relaxed by up to {SETTINGS.widest_dB:g} dB, is shown to be sufficient."
-    return f"{said} if {listed(ways, 'or if')}{' (one of these is sufficient)' if len(ways) > 1 else ''}."
+    return f"{said} if {joined(ways, 'or if')}{' (one of these is sufficient)' if len(ways) > 1 else ''}."
 
 
 def _bounds(plant: DesignPlant) -> list[str]:

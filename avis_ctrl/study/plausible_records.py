@@ -16,7 +16,6 @@ from functools import cached_property
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates import Finding
@@ -24,6 +23,7 @@ from avis_ctrl.measurement.gates.excerpt import excerpt
 from avis_ctrl.measurement.gates.h1 import h1, segment_length, usable
 from avis_ctrl.rigs.plausible_ranges import RANGES, Range
 from avis_ctrl.rigs.rig_writer import file_keys
+from avis_ctrl.summary import joined
 
 
 @dataclass(frozen=True)
@@ -251,7 +251,7 @@ class UnitErrors:
         return Finding(
             "units",
             "warning",
-            f"The signal of {listed(names)} is {10.0**decades:.3g} times the one that the rig's model predicts for "
+            f"The signal of {joined(names)} is {10.0**decades:.3g} times the one that the rig's model predicts for "
             f"these voltages, in all frequency bands{likely}. Check sensitivity, gain and unit before you trust the "
             "fit.",
             names,

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.identification.identifiability_text import listed
 from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.design_check import SimulationCheck
@@ -15,7 +14,7 @@ from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
 from avis_ctrl.study.design_result import AxisGain, ControllerResult, DesignResult, Requirement
 from avis_ctrl.study.limits import no_better_than_none
-from avis_ctrl.summary import digits_apart
+from avis_ctrl.summary import digits_apart, joined
 
 
 def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
@@ -156,13 +155,13 @@ def all_axes(result: DesignResult) -> str:
         for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
         if np.isfinite(bound.upper) and value > decibels(bound.upper)
     ]
-    locked = f"The worst-case bounds hold for {listed(result.design.keep)} with the other coordinates locked"
+    locked = f"The worst-case bounds hold for {joined(result.design.keep)} with the other coordinates locked"
     reached = (
         "With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
         f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}"
     )
     if beyond:
-        compared = f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {listed(beyond)}."
+        compared = f"{locked}. With all six degrees of freedom the nominal sampled loop exceeds them: {joined(beyond)}."
     elif not (np.isfinite(mu.worst_peak.upper) and np.isfinite(mu.worst_band.upper)):
         compared = f"{reached}. For the other plants of the uncertainty set there is no bound."
     else:
@@ -179,7 +178,7 @@ def _outside(result: DesignResult, most: np.ndarray, inside_band: str) -> str:
         return ""
     return (
         f" The axes outside the design have skyhook loops or remain passive; {inside_band} their gain from the floor "
-        f"to the payload along the same axis is at most {listed(rows)}, nominal."
+        f"to the payload along the same axis is at most {joined(rows)}, nominal."
     )
 
 
@@ -221,7 +220,7 @@ def _relaxed(result: DesignResult, moving: Sequence[str]) -> str:
             "the limiting bound or reduce the uncertainty (named below the table of requirements)"
         )
     if outside := [axis for axis in moving if axis not in result.design.keep]:
-        return f"add {listed(outside)} to keep in the design file, or reduce the bandwidth"
+        return f"add {joined(outside)} to keep in the design file, or reduce the bandwidth"
     return "reduce the bandwidth, or use a higher sample rate"
 
 

@@ -22,6 +22,7 @@ from avis_ctrl.gap.validation import Half, Power, halves
 from avis_ctrl.identification.likelihood import Fitted
 from avis_ctrl.identification.single_axis.fit import slopes
 from avis_ctrl.measurement.gates.finding import Picture, Series
+from avis_ctrl.summary import percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,11 +366,6 @@ def _pictures(base: Fitted, best: Fitted, stages: Sequence[Stage]) -> tuple[Pict
         "log",
         "log",
     )
-
-
-def percent(share: float) -> str:
-    """A fraction in per cent, three digits."""
-    return f"{100 * share:.3g} %"
 
 
 def _sentences(

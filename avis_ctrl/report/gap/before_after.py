@@ -28,6 +28,7 @@ from avis_ctrl.report.response_panels import difference, drives, magnitude
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.study.gap_overlay import BESIDE, GapOverlay, gap_overlay
+from avis_ctrl.summary import joined
 
 BEFORE, AFTER, NOISE = Style("#d55e00", "dash", 1.8), Style("#0072b2", "solid", 2.0), Style("#7a7a7a", "dot", 1.6)
 
@@ -124,12 +125,12 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
         )
     if seen.simulated:
         text += (
-            f" {words.joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
+            f" {joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
             "That of the updated model is therefore estimated in the same way as the measured one, from a "
             "simulation of the same records."
         )
     if seen.left_out:
-        names = words.joined(list(map(wording.titled, seen.left_out)))
+        names = joined(list(map(wording.titled, seen.left_out)))
         text += (
             f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
             "no frequency response."

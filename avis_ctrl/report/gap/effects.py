@@ -14,6 +14,7 @@ from avis_ctrl.report.gap import wording
 from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Section, Table, section, shown, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.gap import GapFinding
+from avis_ctrl.summary import joined
 
 
 def parameters(found: GapFinding) -> Section:
@@ -61,7 +62,7 @@ def _as_text(one: NamedEffect) -> str:
     if one.confirmation:
         text += f" {words.sentence(one.confirmation)}"
     if one.indistinguishable_from:
-        names = words.joined(list(map(wording.titled, one.indistinguishable_from)))
+        names = joined(list(map(wording.titled, one.indistinguishable_from)))
         text += f" These data cannot distinguish it from {names}."
     return text
 
@@ -97,7 +98,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
 
 def _together(groups: Sequence[Sequence[str]]) -> Paragraph | None:
     """Parameters that no record determines individually."""
-    told = "; ".join(words.joined(list(group)) for group in groups)
+    told = "; ".join(joined(list(group)) for group in groups)
     text = (
         f"No record can determine {told} individually, only in combination. Their individual values follow from the "
         "combination and the rig file."

@@ -14,6 +14,7 @@ from avis_ctrl.report.identification.gates import warnings
 from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
+from avis_ctrl.summary import joined
 
 CHANCES = (
     " The probability is relative to the candidates fitted in its place, including some faults outside the library; "
@@ -27,7 +28,7 @@ def opening(found: GapFinding) -> Section:
     gap = found.gap
     first, *more = map(words.sentence, gap.sentences)
     limits = "The section on the residual lists the detection limits of the effects."
-    warned = words.joined(warnings(found.findings))
+    warned = joined(warnings(found.findings))
     gates = f"Gates that warned of the records: {warned}; see the section on gates."
     return section(
         "Summary",
@@ -49,7 +50,7 @@ def opening(found: GapFinding) -> Section:
 def in_numbers(gap: Gap) -> str:
     """Error of each stage on held-out data, compared with that of noise alone."""
     told = [f"{words.percent(one.nrmse)} {_stage(one.name)}" for one in gap.stages]
-    text = f"Normalised r.m.s. error on held-out data: {words.joined(told)}"
+    text = f"Normalised r.m.s. error on held-out data: {joined(told)}"
     if np.isfinite(gap.noise_nrmse):
         text += f"; that of the noise alone is estimated at {words.percent(gap.noise_nrmse)}"
     first = next(one.nrmse for one in gap.stages if one.name == "re-identified")
@@ -65,7 +66,7 @@ def in_numbers(gap: Gap) -> str:
 def _group(one: NamedEffect) -> str:
     names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
     return (
-        f"These records cannot distinguish {words.joined(names)}. Any of them may be the cause, and so may a "
+        f"These records cannot distinguish {joined(names)}. Any of them may be the cause, and so may a "
         "cause that was not among the candidates. See the section on what to measure next."
     )
 

@@ -10,6 +10,7 @@ from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.places import table_of
 from avis_ctrl.report.pieces import Paragraph, Section, Table, headed, section, table
 from avis_ctrl.study.gap import GapFinding
+from avis_ctrl.summary import joined
 
 
 def remaining(found: GapFinding) -> Section:
@@ -58,7 +59,7 @@ def _left(gap: Gap) -> str:
     """Size of the residual relative to response and noise, and its growth with level."""
     if gap.raised:
         return (
-            f"The held-out residual is the measured noise. That of {words.joined(list(gap.raised))} is above the "
+            f"The held-out residual is the measured noise. That of {joined(list(gap.raised))} is above the "
             "rig file's ambient level."
         )
     left = gap.left

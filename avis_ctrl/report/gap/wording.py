@@ -11,6 +11,7 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Paragraph
+from avis_ctrl.summary import joined
 from avis_ctrl.uncertain_value import with_prefix
 
 # What each verdict claims, and what it does not.
@@ -45,7 +46,7 @@ def claim(gap: Gap) -> str:
         if not gap.raised
         else RAISED.format(
             verdict=gap.verdict,
-            sensors=words.joined(list(gap.raised)),
+            sensors=joined(list(gap.raised)),
             with_effects=" with the effects named above" if gap.effects else "",
         )
     )

@@ -11,6 +11,7 @@ from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, le
 from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, headed, listed, section, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
+from avis_ctrl.summary import joined
 
 ESTIMATE, RECORDS, LIKELY = Style("#0072b2"), Style("#9a9a9a", "dot", 1.2), Style("#d55e00", "dash", 1.4)
 TITLE = "Comparison of identification methods"
@@ -76,7 +77,7 @@ def _agreement(found: Identification, result: EkfResult) -> Paragraph:
     if broken:
         text += (
             f" The filter's innovations do not agree with its covariance in record{'s' * (len(broken) > 1)} "
-            f"{words.joined(broken)}: its standard deviations are too small."
+            f"{joined(broken)}: its standard deviations are too small."
         )
     return Paragraph(text, "verdict", far == 0 and not broken)
 
@@ -181,7 +182,7 @@ def _hidden(result: EkfResult) -> tuple[str, ...]:
     ]
     held = [name for name, count in zip(result.names, result.guarded, strict=True) if count]
     if held:
-        said.append(f"The lower limit of the parameters was reached by {words.joined(held)}.")
+        said.append(f"The lower limit of the parameters was reached by {joined(held)}.")
     ratios, directions = result.undetermined
     for ratio, direction in zip(ratios, directions.T, strict=True):
         moved = [f"{name} {'up' if weight > 0 else 'down'}" for name, weight in main_members(result.names, direction)]

@@ -12,6 +12,7 @@ from avis_ctrl.report.identification.validation import errors, modes
 from avis_ctrl.report.pieces import Paragraph, Section, Table, section, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.identification import Identification
+from avis_ctrl.summary import joined
 
 TOGETHER = "only in combination"
 
@@ -63,7 +64,7 @@ def _sentence(found: Identification) -> Paragraph:
     if not found.campaign_fit.fit.converged:
         said.append("The fit did not converge.")
     if warned := warnings(found.findings):
-        said.append(f"Gates (data checks) with warnings: {words.joined(warned)}.")
+        said.append(f"Gates (data checks) with warnings: {joined(warned)}.")
     elif found.findings:
         said.append("No gate (data check) gave a warning.")
     return Paragraph(" ".join(said), "verdict", consistent and not stops and found.campaign_fit.fit.converged)

@@ -11,6 +11,7 @@ from avis_ctrl.report.pieces import Paragraph, Section, section
 from avis_ctrl.report.response_panels import MEASURED, SCATTER, Model, difference, drives, magnitude, thin, title, unit
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.identification import Identification
+from avis_ctrl.summary import joined
 
 START, MODEL = Style("#e69f00", "dash", 1.6), Style("#0072b2", "solid", 1.6)
 
@@ -22,7 +23,7 @@ def responses(found: Identification) -> Section:
         why = "No measured frequency response can be shown; the notes of the section on validation state the reason."
         return section("Frequency responses", "responses", Paragraph(why))
     pairs = strongest(seen)
-    named = words.joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
+    named = joined([f"{seen.outputs[i]} from {seen.inputs[j]}" for i, j in pairs])
     text = (
         f"Measured: {seen.method}. {words.number(100 * seen.inside)} % of the measured values lie within "
         f"their 95 % confidence region about the identified model; 95 % are expected if they differ from the model "

@@ -15,7 +15,7 @@ from avis_ctrl.study.identification import Identification
 from avis_ctrl.study.identified_uncertainty import SETTINGS as COMPARED
 from avis_ctrl.study.identified_uncertainty import InDesign
 from avis_ctrl.study.uncertainty_file import UncertaintyFile
-from avis_ctrl.summary import count_of
+from avis_ctrl.summary import count_of, joined
 
 
 def identified(result: DesignResult) -> tuple[Piece, ...]:
@@ -71,7 +71,7 @@ def uncertainty(found: Identification, made: InDesign | None) -> Section:
             "result.json."
         )
         return section(title, anchor, Paragraph(missing))
-    kept = words.joined([words.axis(name) for name in made.spread.keep])
+    kept = joined([words.axis(name) for name in made.spread.keep])
     count = len(made.directions)
     bounded = (
         f"the joint covariance of the parameters is represented by {count_of(count, 'bounded direction')}"

@@ -17,6 +17,7 @@ from avis_ctrl.study.analysis import SETTINGS as CURVES
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import EFFORT, DesignPlant
+from avis_ctrl.summary import joined
 from avis_ctrl.uncertainty.uncertain_rig import UncertainDirection, UncertainEquation
 from avis_ctrl.uncertainty.weights import NeglectedDynamics
 
@@ -50,7 +51,7 @@ def generalized_plant(result: DesignResult) -> Section:
         f"The plant of the synthesis has {P.P.nstates} states, {P.ncon} commands, {P.nmeas} "
         f"measurements, {len(P.w)} disturbances, {len(P.z)} weighted outputs and "
         f"{len(P.blocks.blocks)} blocks of uncertainty. The axes are "
-        f"{words.joined([words.axis(a) for a in plant.axes])}."
+        f"{joined([words.axis(a) for a in plant.axes])}."
     )
     meanings = Bullets([f"{n}: {w.meaning}" for n, w in plant.weights.items()])
     figures = (_transmissibility_weight(result), _effort(result), _chains(plant), _noise(result), _compliance(result))

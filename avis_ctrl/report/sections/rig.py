@@ -17,6 +17,7 @@ from avis_ctrl.rigs.rig import Parameter, Rig
 from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.summary import joined
 
 # By measured quantity: kind of sensor, unit of its gain, and scale factor and unit of its limit.
 _KINDS = {
@@ -204,7 +205,7 @@ def _reduction(result: DesignResult) -> list[Piece]:
     if not error.left_out.size:
         told = "The controller is designed on a model with all six degrees of freedom; no coordinate is locked."
         return [Heading("Design model"), Paragraph(told)]
-    kept = words.joined(list(error.keep))
+    kept = joined(list(error.keep))
     text = (
         f"The controller is designed on a model of {kept} alone, with the other coordinates locked. The table and "
         "the figure show the difference from the model with six degrees of freedom, relative to the largest gain "

@@ -13,6 +13,7 @@ from avis_ctrl.report.pieces import Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.analysis import SETTINGS as CURVES
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
+from avis_ctrl.summary import joined
 
 
 def transmissibility(result: DesignResult) -> Section:
@@ -41,7 +42,7 @@ def _against_skyhook(result: DesignResult) -> Table:
 def left_out(result: DesignResult) -> str:
     """Sentence on the controllers that a figure of the nominal loop omits, because their loop is unstable."""
     unstable = [c.title for c in result.controllers if not c.stable]
-    return f" Not shown, because the nominal loop is unstable: {words.joined(unstable)}." if unstable else ""
+    return f" Not shown, because the nominal loop is unstable: {joined(unstable)}." if unstable else ""
 
 
 def target(result: DesignResult) -> Curve:

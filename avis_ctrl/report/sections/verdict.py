@@ -12,7 +12,7 @@ from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 from avis_ctrl.study.verdict import all_axes, first_sentence
-from avis_ctrl.summary import digits_apart
+from avis_ctrl.summary import digits_apart, joined
 
 
 def verdict(result: DesignResult) -> Section:
@@ -45,10 +45,10 @@ def _asked(result: DesignResult) -> Paragraph:
     """The task."""
     design, uncertain = result.design, result.design.uncertainty.parameters_percent
     low, high = design.transmissibility.band_Hz
-    spread = words.joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
+    spread = joined([f"{name} ± {value:g} %" for name, value in uncertain.items()]) if uncertain else ""
     members = f"every plant of the uncertainty set{' with ' * bool(spread)}{spread}"
     return Paragraph(
-        f"Task: one controller for {words.joined([words.axis(name) for name in result.plant.axes])} of the rig "
+        f"Task: one controller for {joined([words.axis(name) for name in result.plant.axes])} of the rig "
         f"{result.rig.name}. It must stabilise {members}. The weight of the synthesis demands a transmissibility "
         f"of at most {design.transmissibility.band_dB:+g} dB from {low:g} to {high:g} Hz, and of at most "
         f"{design.transmissibility.peak_dB:+g} dB at all other frequencies."
