@@ -79,8 +79,18 @@ def doctor() -> None:
 
 
 for command in (
-    *(design, compare, export, identify, gap, predict),
-    *(gap_axis, excite, simulate_campaign, convert, single_axis, sweep),
+    design,
+    compare,
+    export,
+    identify,
+    gap,
+    predict,
+    gap_axis,
+    excite,
+    simulate_campaign,
+    convert,
+    single_axis,
+    sweep,
 ):
     app.command(epilog=LAYOUTS if command in (identify, gap, convert) else None)(command)
 app.add_typer(new, name="new")

@@ -17,11 +17,11 @@ from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
-from avis_ctrl.gap.parallel import Mapper, Progress, Run, sequential_map
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
 from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
+from avis_ctrl.gap.run import Mapper, Progress, Run, sequential_map
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, is_weak, outliers, search, without_effect
 from avis_ctrl.gap.settings import SETTINGS, GapSettings

@@ -17,8 +17,8 @@ import scipy.fft
 
 from avis_ctrl.gap.line_response import LineResponse, line_response
 from avis_ctrl.gap.operators import Assembled, mount_geometry
-from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.record_motion import SETTINGS, RecordMotion
+from avis_ctrl.gap.run import Mapper, sequential_map
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.large_motion import second_order
 from avis_ctrl.identification.predictor import model_inputs

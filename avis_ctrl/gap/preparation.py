@@ -17,7 +17,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
-from avis_ctrl.gap.parallel import Run
+from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
 from avis_ctrl.gap.signals.converter import ConverterFinding

@@ -20,8 +20,8 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.parallel import Run
 from avis_ctrl.gap.probability import Step, name_of, probability_of
+from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
@@ -185,8 +185,9 @@ def search(
         if not _revised(steps, data, settings):
             break
         more(effects, enough)
-    if steps:
-        more(of_values(effects, base.model), lambda step: False)
+    values = of_values(effects, base.model)
+    if steps and len(values) < len(effects):  # otherwise they have just been searched
+        more(values, lambda step: False)
     return steps
 
 

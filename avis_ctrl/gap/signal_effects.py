@@ -11,8 +11,8 @@ import numpy as np
 
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.mounts import campaign_clock
-from avis_ctrl.gap.parallel import Mapper, sequential_map
 from avis_ctrl.gap.result import NamedEffect
+from avis_ctrl.gap.run import Mapper, sequential_map
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signals.converter import ConverterFinding, inspect_converter
 from avis_ctrl.gap.signals.hum import HumFinding, subtract

@@ -24,8 +24,24 @@ from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines
 from avis_ctrl.identification import campaign_fit
 
 PARTS = (
-    *(settings, starting_values, score, base, table_model, campaign_spectra, residual, power_shares, next_measurement),
-    *(record_motion, line_response, state_space, converter, hum, noise_level, quiet_lines, axis, campaign_fit),
+    settings,
+    starting_values,
+    score,
+    base,
+    table_model,
+    campaign_spectra,
+    residual,
+    power_shares,
+    next_measurement,
+    record_motion,
+    line_response,
+    state_space,
+    converter,
+    hum,
+    noise_level,
+    quiet_lines,
+    axis,
+    campaign_fit,
 )
 
 

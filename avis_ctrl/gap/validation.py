@@ -127,8 +127,8 @@ def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, np.ndarray]]:
 
 
 def by_information(values: np.ndarray, information: np.ndarray, *words: str) -> list[tuple[str, np.ndarray]]:
-    """Rows (N,) with low and with high values, each with about half of the information, which is given by row, and
-    their names; empty if they cannot be divided."""
+    """Names and rows of the half with low and of that with high values (N,), each with about half of the information
+    (N,); empty if the values cannot be divided."""
     _, place = np.unique(values, return_inverse=True)
     total = np.cumsum(np.bincount(place, information))
     low = (total <= total[-1] / 2)[place]

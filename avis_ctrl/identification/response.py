@@ -705,10 +705,9 @@ class ResponseModel:
             seen -= (mat.R[:, :3] * self.sensors.relative[:, None]) @ (floor / s)
         S = self.sensors.sensitivity[:, None]
         Y = S * out * seen
-        Minv = np.linalg.inv(mat.M)
         if driven:
             # Aliases pass the chain far above its corners.
-            Y += S * alias * (mat.R @ Minv @ mat.T @ volts)
+            Y += S * alias * (self.accelerance @ volts)
         if not derivative:
             return Driven(Y, np.empty(0))
         left, w = S * out * (mat.R @ inverse), floor / s
@@ -717,7 +716,7 @@ class ResponseModel:
         for name in OF_DRIVES:
             if name in self.names:
                 slope, folded = self.drive_slopes(omega, name)
-                moved = out * (mat.R @ inverse @ mat.T @ (slope * volts)) + folded * (mat.R @ Minv @ mat.T @ volts)
+                moved = out * (mat.R @ inverse @ mat.T @ (slope * volts)) + folded * (self.accelerance @ volts)
                 dY[self.names.index(name)] = S * moved
         return Driven(Y, dY)
 

@@ -29,7 +29,7 @@ def axes_of(given: Any, rows: int = 1) -> Any:
 
 
 def png(draw: Callable[[Any], Any], width: float, height: float) -> bytes:
-    """What `draw` draws into axes, as the bytes of a PNG file; width, height in inches."""
+    """A plot as the bytes of a PNG file. draw : draws into the axes that it receives. width, height : in inches."""
     from matplotlib.figure import Figure
 
     file, figure = io.BytesIO(), Figure(figsize=(width, height), layout="constrained")

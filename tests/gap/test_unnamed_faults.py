@@ -10,8 +10,8 @@ import pytest
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.motion_estimate import mount_rows
-from avis_ctrl.gap.parallel import Run
 from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.score import Score
 from avis_ctrl.gap.search import search
 from avis_ctrl.gap.settings import GapSettings

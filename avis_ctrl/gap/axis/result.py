@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from avis_ctrl.gap.effects.base import Reported
@@ -54,8 +54,8 @@ class AxisGap(Findings):
             "version": 2,
             "kind": self.kind,
             **self.findings(),
-            "base_parameters": {name: one.to_json() for name, one in self.parameters.items()},
-            "ratios": {name: one.to_json() for name, one in self.ratios.items()},
+            "base_parameters": {name: asdict(one) for name, one in self.parameters.items()},
+            "ratios": {name: asdict(one) for name, one in self.ratios.items()},
             "runners_up": [vars(one) for one in self.runners_up],
             "sentences": list(self.sentences),
             "seconds": round(self.seconds, 2),

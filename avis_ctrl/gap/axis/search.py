@@ -131,7 +131,8 @@ class Explored:
         return sorted(found, key=lambda c: -c.reduction)
 
     def _candidate(self, profile: Profile, one: Effect, seed: np.ndarray) -> Candidate:
-        """Along the derivatives by the parameters of an effect at its seed; only the linear ones, if there are any."""
+        """An effect at its seed. Directions: the derivatives with respect to its linear parameters, if it has any, or
+        to all of them."""
         now = profile.fitted
         model = now.model.with_effect(one, seed)
         rows = [
@@ -143,7 +144,7 @@ class Explored:
         return Candidate(((one, seed),), C, C @ profile.e)
 
     def in_place_of(self, now: Fitted, label: str, effects: Sequence[Effect], most: int) -> list[tuple[Effect, Fitted]]:
-        """Other effects in the place of one, and their fits; at most `most`, promising to first order."""
+        """Other effects in the place of one, and their fits: the best to first order, at most `most`."""
         rest, own = self.without(now, label), now.model.effect(label).key
         found = [] if rest is None else self.candidates(rest, effects)
         known = max((c.reduction for c in found if c.first.key == own), default=0.0)

@@ -170,10 +170,6 @@ class Reported:
     def __str__(self) -> str:
         return uncertain_value.text(self.value, self.std, self.unit)
 
-    def to_json(self) -> dict[str, float | str]:
-        """The fields by name."""
-        return {"value": self.value, "std": self.std, "unit": self.unit}
-
 
 class Added(NamedTuple):
     """Contribution of an effect to a record on its lines, (n, channels) each; None for none.
