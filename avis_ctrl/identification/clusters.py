@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.identification.weights import Group
+from avis_ctrl.identification.variances import Group
 
 
 def cluster_moves(

@@ -34,7 +34,10 @@ class FitSettings:
     error_weight : degrees of freedom of the priors of the variances; two, the minimum for a finite mean of the
         precision.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
-    climbs : ascent steps of the likelihood of the variances in each estimate.
+    variance_steps : maximum number of scoring steps from each start of an estimate of the variances; on average,
+        six suffice.
+    variance_settled : expected rise of the log-likelihood of one sensor in one band [nats] below which they stop.
+    longest_step : maximum change of the logarithm of a variance in one step [1], a factor of twenty.
     rounds, settled : maximum number of estimates of the variances, each from the fit before it, and rise of the
         log-likelihood [nats] below which they stop: well below what decides between two effects.
     iterations : Gauss-Newton steps between two estimates of the variances.
@@ -65,7 +68,9 @@ class FitSettings:
     least_error: float = 1e-3
     error_weight: float = 2.0
     first_error: float = 0.05
-    climbs: int = 60
+    variance_steps: int = 40
+    variance_settled: float = 1e-3
+    longest_step: float = 3.0
     rounds: int = 12
     settled: float = 1.0
     iterations: int = 6

@@ -22,17 +22,8 @@ from avis_ctrl.identification.maximum_likelihood import block_residual, transien
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.weights import (
-    Group,
-    Variances,
-    Weights,
-    bands,
-    estimated,
-    log_prior,
-    mean_noise,
-    path_contributions,
-    weigh,
-)
+from avis_ctrl.identification.variances import Group, Variances, bands, estimated, log_prior, mean_noise
+from avis_ctrl.identification.weights import Weights, path_contributions, weigh
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from avis_ctrl.gap.axis.settings import SETTINGS, AxisSettings
 from avis_ctrl.gap.dahl import dahl
 from avis_ctrl.identification.likelihood import Data
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.weights import bands
+from avis_ctrl.identification.variances import bands
 
 
 @dataclass(frozen=True, eq=False)
