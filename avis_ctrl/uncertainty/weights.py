@@ -130,7 +130,8 @@ class ControlEffort(Weight):
                 "offset of the electronics"
             )
         return (
-            f"{text} up to {self.bandwidth_Hz:g} Hz, falling with order 1 to a fraction {1 / self.reduction:.2g} of it"
+            f"{text} up to {self.bandwidth_Hz:g} Hz, falling at 20 dB per decade to a fraction "
+            f"{1 / self.reduction:.2g} of it"
         )
 
 
@@ -193,5 +194,5 @@ class NeglectedDynamics(Weight):
     def meaning(self) -> str:
         return (
             f"relative uncertainty {100 * self.low:g} % at low frequency, 100 % at {self.crossover_Hz:g} Hz, "
-            f"{100 * self.high:g} % at high frequency, order 1"
+            f"{100 * self.high:g} % at high frequency, realised with one state"
         )

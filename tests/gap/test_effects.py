@@ -216,12 +216,12 @@ def test_an_integrator_feeds_energy_in():
 CHASSIS = {
     "mass_kg": 900.0,
     "damping": 0.05,
-    "x_Hz": 9.0,
-    "y_Hz": 11.0,
-    "z_Hz": 14.0,
-    "rx_Hz": 10.0,
-    "ry_Hz": 12.0,
-    "rz_Hz": 13.0,
+    "frequency_x_Hz": 9.0,
+    "frequency_y_Hz": 11.0,
+    "frequency_z_Hz": 14.0,
+    "frequency_rx_Hz": 10.0,
+    "frequency_ry_Hz": 12.0,
+    "frequency_rz_Hz": 13.0,
     "gyration_x_m": 0.4,
     "gyration_y_m": 0.5,
     "gyration_z_m": 0.6,
@@ -247,11 +247,11 @@ def test_base_compliance_is_a_second_body(place):
     height = v["centre_z_m"] if rocking else 0.0
     centre, below = (0, 0, height), (0, 0, height + (v["base_z_m"] if rocking else 0.0))
     for a, axis in enumerate("xyz"):
-        m, w = v["mass_kg"], 2 * np.pi * v[f"{axis}_Hz"]
+        m, w = v["mass_kg"], 2 * np.pi * v[f"frequency_{axis}_Hz"]
         at_centre, at_base = (np.concatenate([np.zeros(6), mount_map(p)[a]]) for p in (centre, below))
         table.mass(at_centre, m)
         table.spring(at_base, m * w**2, 2 * v["damping"] * w * m, np.eye(3)[a])
-        J, w = m * v[f"gyration_{axis}_m"] ** 2, 2 * np.pi * v[f"r{axis}_Hz"]
+        J, w = m * v[f"gyration_{axis}_m"] ** 2, 2 * np.pi * v[f"frequency_r{axis}_Hz"]
         turned = table.row(**{f"e{3 + a}": 1.0})
         table.mass(turned, J)
         table.spring(turned, J * w**2, 2 * v["damping"] * w * J)
@@ -260,7 +260,7 @@ def test_base_compliance_is_a_second_body(place):
 
 def test_momentum_is_conserved_far_above_the_resonance_of_the_base():
     """Without outer force payload and chassis move against each other, in inverse proportion to their masses."""
-    model = on_chassis("chassis/translation", x_Hz=2.0, y_Hz=2.0, z_Hz=2.0, damping=1e-3)
+    model = on_chassis("chassis/translation", frequency_x_Hz=2.0, frequency_y_Hz=2.0, frequency_z_Hz=2.0, damping=1e-3)
     made = Assembled(model.operators(2 * np.pi * np.array([2000.0])))
     x = made.inverse @ np.asarray(made.T[:, :1])[None]
     moved = made.chassis(x, np.zeros((1, 3, 1)))
@@ -272,7 +272,9 @@ def test_a_heavy_chassis_is_a_stiff_floor():
     for mass, close in ((1e5, 0.05), (1e12, 1e-8)):  # its own resonances stay, but nothing of the table moves it
         by_u = on_chassis("chassis/rocking", mass_kg=mass).response(OMEGA)[:, :, :8]
         assert np.max(np.abs(by_u - bare[:, :, :8])) < close * np.max(np.abs(bare[:, :, :8]))
-    hard = on_chassis("chassis/translation", mass_kg=1e12, x_Hz=1e5, y_Hz=1e5, z_Hz=1e5).response(OMEGA)
+    hard = on_chassis(
+        "chassis/translation", mass_kg=1e12, frequency_x_Hz=1e5, frequency_y_Hz=1e5, frequency_z_Hz=1e5
+    ).response(OMEGA)
     np.testing.assert_allclose(hard, bare, rtol=1e-3)  # (150 Hz / 100 kHz)^2 and the damper
 
 

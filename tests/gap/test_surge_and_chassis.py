@@ -164,7 +164,7 @@ def test_a_light_chassis_is_found_although_tolerances_imitate_it_at_first():
     assert [one.name for one in found.effects] == ["base_compliance"]
     told, true = found.effects[0].parameters, case.effects[0].parameters
     assert abs(told["mass_kg"].value - true["mass_kg"]) < 3 * told["mass_kg"].std
-    assert told["z_Hz"].value == pytest.approx(true["frequency_Hz"], rel=0.002)
+    assert told["frequency_z_Hz"].value == pytest.approx(true["frequency_Hz"], rel=0.002)
 
 
 def test_coupled_resonances_are_found_beside_a_fit_with_other_ones():
@@ -186,7 +186,7 @@ def test_six_sharp_resonances_of_a_chassis_are_found():
     found = analyse(simulate_case(case), rig(), effects=[library()["base_compliance"]])
     assert [one.name for one in found.effects] == ["base_compliance"]
     told, true = found.effects[0].parameters, case.effects[0]
-    names = [f"{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
+    names = [f"frequency_{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
     np.testing.assert_allclose([told[name].value for name in names], true.details["frequencies_Hz"], rtol=0.01)
     assert told["mass_kg"].value == pytest.approx(true.parameters["mass_kg"], rel=0.02)
 
@@ -203,6 +203,6 @@ def test_coupled_sharp_resonances_of_a_chassis_are_found(seed, options):
     )
     assert [one.name for one in found.effects] == [true.name] == ["base_compliance"]
     told = found.effects[0].parameters
-    names = [f"{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
+    names = [f"frequency_{coordinate}_Hz" for coordinate in ("x", "y", "z", "rx", "ry", "rz")]
     np.testing.assert_allclose([told[name].value for name in names], true.details["frequencies_Hz"], rtol=0.005)
     assert told["mass_kg"].value == pytest.approx(true.parameters["mass_kg"], rel=0.01)

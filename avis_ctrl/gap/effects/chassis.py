@@ -45,7 +45,7 @@ class BaseCompliance(OfMounts):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         m, shape = model.rig.mounted_body().mass, partial(EffectParameter.shape, optional=True)
-        along = shape("{}_Hz", "Hz", "of the chassis on its base, along {}", 1.0, 300.0, 10.0, (20.0,))
+        along = shape("frequency_{}_Hz", "Hz", "of the chassis on its base, along {}", 1.0, 300.0, 10.0, (20.0,))
         found = (
             EffectParameter.shape("mass_kg", "kg", "of the chassis", 0.05 * m, 400 * m, m, (2 * m,)),
             shape("damping", "1", "damping ratio", 1e-3, 1.0, 0.05, (0.06,)),
@@ -55,7 +55,7 @@ class BaseCompliance(OfMounts):
             return found
         return (
             *found,
-            *replace(along, name="r{}_Hz", description="of the chassis on its base, about {}").of_each("xyz"),
+            *replace(along, name="frequency_r{}_Hz", description="of the chassis on its base, about {}").of_each("xyz"),
             *shape("gyration_{}_m", "m", "radius of gyration about {}", 0.03, 5.0, 0.3, (0.5,)).of_each("xyz"),
             shape("centre_z_m", "m", "height of its mass over the table's centre", -3.0, 1.0, 0.3, (-0.5,)),
             shape("base_z_m", "m", "height of its springs over its mass", -2.0, 2.0, 0.3, (0.0,)),
@@ -104,7 +104,7 @@ class BaseCompliance(OfMounts):
         for group in TOGETHER:
             if not set(group) <= set(_coordinates(place)):
                 continue
-            fixed = one.by_name | {f"{coordinate}_Hz": SETTINGS.chassis_fixed_Hz for coordinate in group}
+            fixed = one.by_name | {f"frequency_{coordinate}_Hz": SETTINGS.chassis_fixed_Hz for coordinate in group}
             rest = around.e + recoil_of(around, partial(_difference, one.by_name, fixed))
             own = set(map(COORDINATES.index, group))
             columns = [k for k, entry in enumerate(ENTRIES) if set(entry) <= own]
@@ -128,7 +128,7 @@ def of_chassis(values: Values) -> np.ndarray:
     centre; zero in the coordinates in which it does not move."""
     radii = [1.0, 1.0, 1.0, *(values.get(f"gyration_{axis}_m", 0.0) for axis in "xyz")]
     inertia = values["mass_kg"] * np.square(radii)
-    w = 2 * np.pi * np.array([values.get(f"{coordinate}_Hz", 0.0) for coordinate in COORDINATES])
+    w = 2 * np.pi * np.array([values.get(f"frequency_{coordinate}_Hz", 0.0) for coordinate in COORDINATES])
     found = np.zeros((3, 6, 6))
     centre = np.array([0.0, 0.0, values.get("centre_z_m", 0.0)])
     G, below = point_map(centre), point_map(centre + np.array([0.0, 0.0, values.get("base_z_m", 0.0)]))
@@ -144,7 +144,7 @@ def _recoil(values: Values, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     mass, damping, stiffness = of_chassis(values)
     s = s[:, None, None]
     tied = stiffness + s * damping
-    if "rx_Hz" in values:
+    if "frequency_rx_Hz" in values:
         B = np.linalg.inv(s**2 * mass + tied)
         return B, B @ tied[:, :, :3]
     B, H, along = np.zeros((len(s), 6, 6), complex), np.zeros((len(s), 6, 3), complex), range(3)
@@ -192,7 +192,7 @@ def _body_of(group: Sequence[str], entries: np.ndarray, f: np.ndarray, now: Valu
         if entries[0, 0] <= 0:
             return {}
         own = {turn: _radius(now["mass_kg"], entries[0, 0])} if len(group[0]) > 1 else {}
-        return {f"{group[0]}_Hz": float(f[0])} | own
+        return {f"frequency_{group[0]}_Hz": float(f[0])} | own
     residues, w = entries[:, [[0, 2], [2, 1]]], 2 * np.pi * f[:, None, None]
     inverse, compliance = residues.sum(axis=0), (residues / w**2).sum(axis=0)
     if min(np.linalg.eigvalsh(inverse)[0], np.linalg.eigvalsh(compliance)[0]) <= 0:
@@ -206,8 +206,8 @@ def _body_of(group: Sequence[str], entries: np.ndarray, f: np.ndarray, now: Valu
     inertia, rotation = M[1, 1] - mass * centre**2, K[1, 1] - K[0, 0] * springs**2
     return {
         "mass_kg": mass,
-        f"{group[0]}_Hz": np.sqrt(K[0, 0] / mass) / (2 * np.pi),
-        f"{group[1]}_Hz": np.sqrt(rotation / inertia) / (2 * np.pi),
+        f"frequency_{group[0]}_Hz": np.sqrt(K[0, 0] / mass) / (2 * np.pi),
+        f"frequency_{group[1]}_Hz": np.sqrt(rotation / inertia) / (2 * np.pi),
         turn: np.sqrt(inertia / mass),
         "centre_z_m": centre,
         "base_z_m": springs - centre,
