@@ -262,8 +262,12 @@ def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[flo
 def fit(
     model: Any, priors: Priors, z: np.ndarray, data: Data, variances: Variances, settings: FitSettings = SETTINGS
 ) -> Fitted:
-    """Alternate Gauss-Newton steps in z with estimates of the variances."""
-    steps, best, noise = 0, None, mean_noise(data.blocks, data.levels, settings)
+    """Alternate Gauss-Newton steps in z with estimates of the variances.
+
+    Only the distortion is estimated until the log-likelihood settles, then the path errors, too: they would otherwise
+    explain what the parameters explain after a few more steps.
+    """
+    steps, best, noise, released = 0, None, mean_noise(data.blocks, data.levels, settings), False
     model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
@@ -280,9 +284,10 @@ def fit(
         rise = reached - best[0] if best else np.inf
         if rise > 0:
             best = reached, at, weights, variances
-        if k == settings.rounds or rise < settings.settled:
+        if k == settings.rounds or (released and rise < settings.settled):
             break
-        variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings)
+        released = rise < settings.settled or k == settings.rounds - 1
+        variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings, hold_path=not released)
     assert best is not None
     reached, at, weights, variances = best
     H = at.H + np.eye(len(at.z))
@@ -320,9 +325,8 @@ def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETT
         ].error[:, :, 0]
         for block in data.blocks
     ]
-    variances = estimated(
-        left, data.blocks, data.levels, paths, Variances(path, fitted.variances.distortion), settings, hold_path=True
-    )
+    start = Variances(path, fitted.variances.distortion)
+    variances = estimated(left, data.blocks, data.levels, paths, start, settings, hold_path=True)
     return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
 
 

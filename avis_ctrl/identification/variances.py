@@ -118,7 +118,8 @@ def estimated(
 ) -> Variances:
     """Most likely variances of path errors and distortion, for residuals `left` (n, n_y) of each block.
 
-    paths : (n, n_y, k) contributions of the inputs. hold_path : keep the variances of the path errors.
+    paths : (n, n_y, k) contributions of the inputs. hold_path : keep the variances of the path errors, and follow the
+    maximum near the old variances of the distortion.
 
     The likelihood has several maxima: path errors may explain the residual of one level while all of another is
     distortion. So the search starts from several such divisions and from the old variances, and the best end counts.
@@ -155,19 +156,17 @@ def estimated(
 
 
 def _most_likely(sums: _Sums, old: np.ndarray, settings: FitSettings, hold_path: bool) -> np.ndarray:
-    """theta = log (v, s) (n, 1 + L) of the highest maximum that the starts lead to."""
+    """theta = log (v, s) (n, 1 + L) of the highest maximum; with `hold_path`, of the one near the old values."""
     least = np.concatenate(
         [np.full((len(old), 1), settings.least_error**2), settings.least_distortion * sums.noise], axis=1
     )
-    ends = [
-        _descent(sums, start, least, settings, hold_path)
-        for start in (old, *_starts(sums, old, np.log(least), hold_path))
-    ]
+    starts = [old, *(() if hold_path else _starts(sums, np.log(least)))]
+    ends = [_descent(sums, start, least, settings, hold_path) for start in starts]
     best = np.argmin([cost for _, cost in ends], axis=0)
     return np.array([theta for theta, _ in ends])[best, np.arange(len(old))]
 
 
-def _starts(sums: _Sums, old: np.ndarray, least: np.ndarray, hold_path: bool) -> Iterator[np.ndarray]:
+def _starts(sums: _Sums, least: np.ndarray) -> Iterator[np.ndarray]:
     """theta (n, 1 + L) of each start: path errors explain nothing, all that they can at one level, or at all levels.
     least : (n, 1 + L) minimum of theta."""
 
@@ -177,15 +176,12 @@ def _starts(sums: _Sums, old: np.ndarray, least: np.ndarray, hold_path: bool) ->
 
     def explained(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log v (n, 1) of the path errors that explain as much as they can under distortion s, and what they leave."""
-        if hold_path:
-            *_, left = sums.path_errors(np.concatenate([old[:, :1], s], axis=1))
-            return old[:, :1], left
         *_, x, left = sums.path_errors(np.concatenate([np.zeros((len(s), 1)), s], axis=1))
         size = np.log(np.mean(np.abs(x) ** 2, axis=1, keepdims=True) + np.finfo(float).tiny)
         return np.maximum(size, least[:, :1]), left
 
     whole = distortion(sums.q)
-    yield np.concatenate([old[:, :1] if hold_path else least[:, :1], whole], axis=1)
+    yield np.concatenate([least[:, :1], whole], axis=1)
     for level in range(whole.shape[1]):
         s = whole.copy()
         s[:, level] = least[:, 1 + level]
