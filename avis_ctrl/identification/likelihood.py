@@ -286,7 +286,7 @@ def fit(
             best = reached, at, weights, variances
         if k == settings.rounds or (released and rise < settings.settled):
             break
-        released = rise < settings.settled or k == settings.rounds - 1
+        released = released or rise < settings.settled or k == settings.rounds - 1
         variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings, hold_path=not released)
     assert best is not None
     reached, at, weights, variances = best
