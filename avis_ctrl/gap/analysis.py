@@ -268,14 +268,16 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     """Assemble the result; stages, maps and sentences are computed on held-out records."""
     blocks, updated, settings, progress = prepared.held_out, names.updated, prepared.run.settings, prepared.run.progress
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
-    raw = ModelResidual.of(fits.base.model, prepared.unmasked)
+    raw, tolerant = ModelResidual.of(fits.base.model, prepared.unmasked), fits.tolerant.model
     noise = after.noise_nrmse**2
     power = Power(noise, before.nrmse**2)
     stages = [
         Stage("nominal", *_figures(ModelResidual.of(with_second_order(prepared.nominal), prepared.unmasked))),
         Stage("re-identified", *_figures(raw)),
-        Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, blocks))),
+        Stage("tolerances", *_figures(ModelResidual.of(tolerant, prepared.unmasked))),
     ]
+    if prepared.faults.hum is not None:
+        stages.append(Stage("mains_hum", *_figures(ModelResidual.of(tolerant, blocks))))
     stages += [
         Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
         for label, one in _chain(fits, updated, prepared)

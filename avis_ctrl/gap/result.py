@@ -266,7 +266,7 @@ class Gap(Findings):
     Attributes
     ----------
     verdict : one of VERDICTS. effects : named. stages : on held-out data, "nominal", "re-identified", "tolerances",
-        then one for each effect; from "tolerances" on without the lines polluted by hum, if there is any.
+        then "mains_hum", if there is any, without the polluted lines, and one for each effect that a model explains.
     where : location of the gap after re-identification. remaining : the same after the named effects.
     noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
     baseline, updated : models (without named effects, updated is the baseline with all tolerances fitted).

@@ -112,6 +112,11 @@ class Explored:
         """Evidence of the fitted data plus log-likelihood of the held-out data."""
         return one.log_evidence + self.held_out(one)
 
+    def score_without(self, one: Fitted, label: str) -> float:
+        """Score of the fit without one of its effects; minus infinity if it did not converge."""
+        rest = self.without(one, label)
+        return -math.inf if rest is None else self.score(rest)
+
     def odds_against(self, one: Fitted, other: Fitted) -> float:
         """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out
         data, or by how evenly their difference is spread over segments and octaves, whichever is larger: the residual
