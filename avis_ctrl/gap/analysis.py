@@ -23,7 +23,16 @@ from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.run import Mapper, Progress, Run, sequential_map
 from avis_ctrl.gap.score import EvidenceScore
-from avis_ctrl.gap.search import backward_elimination, forbidden, implausible, is_weak, outliers, search, without_effect
+from avis_ctrl.gap.search import (
+    backward_elimination,
+    forbidden,
+    implausible,
+    is_weak,
+    outliers,
+    restarted,
+    search,
+    without_effect,
+)
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import levels, named, time_residuals
 from avis_ctrl.gap.table_model import TableModel
@@ -37,7 +46,7 @@ from avis_ctrl.gap.tolerances import (
     with_tolerance,
 )
 from avis_ctrl.gap.validation import Power, halves, share_of
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods, without_path_errors
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
@@ -130,7 +139,18 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    return _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
+    found = _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
+    if credible(found.best, settings):
+        return found
+    # Values moved this far may imitate an effect; a search that begins with them begins with all values wrong.
+    progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
+    stiff = without_path_errors(base, data, settings)
+    at_file = replace(tolerant, model=apart, z=priors.z(apart.values), variances=stiff.variances)
+    step = restarted(stiff, at_file, tolerant, data, [*effects, *unnamed_faults().values()], prepared.run)
+    if step is None or step.fitted.log_evidence < found.best.log_evidence + settings.certain:
+        return found
+    rivals = {**found.steps[0].tried, **step.tried} if found.steps else step.tried
+    return _searched(Fits(base, tolerant, (replace(step, tried=rivals),), step.fitted), prepared, effects)
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:

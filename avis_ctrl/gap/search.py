@@ -318,6 +318,23 @@ def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) ->
     return Step(now.bare(), full, tried, len(found))
 
 
+def restarted(base: Fitted, start: Fitted, now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> Step | None:
+    """The effect with the largest evidence in fits that start with the values of the rig file; None if there is none.
+
+    base : the fit whose tolerances are fixed, beside which the effects are searched. start : model, priors, values and
+    variances with which the fits of all parameters start. now : the fit before the step.
+    """
+    step = next_effect(base, data, effects, run)
+    if step is None:
+        return None
+    tried = _likelier(_joint_fits(start, [one.model.effects[-1] for one in step.tried.values()], data, run))
+    if not tried:
+        return None
+    best = tried[_likeliest(tried)]
+    full = fit(best.model, best.priors, best.z, data, best.variances, run.settings)
+    return Step(now.bare(), full, tried, step.candidates)
+
+
 @dataclass(frozen=True, eq=False)
 class _Begun:
     """An effect after a fit of its own parameters alone: gain of log evidence, and reduction of the sum of squares."""
