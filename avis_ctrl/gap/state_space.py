@@ -287,7 +287,7 @@ def chassis(
     free = [
         a
         for a, name in enumerate(table.keep)
-        if (f"r{name[-1]}_Hz" if name.startswith("phi") else f"{name}_Hz") in values
+        if (f"frequency_r{name[-1]}_Hz" if name.startswith("phi") else f"frequency_{name}_Hz") in values
     ]
     own = np.ix_(free, free)
     by_mass = np.linalg.inv(mass[own]) if free else np.zeros((0, 0))

@@ -49,7 +49,9 @@ def test_the_sentence_gives_place_and_direction_also_where_they_are_zero():
         "y 15.000 +- 0.010 Hz, z 22.000 +- 0.010 Hz, position x 0.3000 +- 0.0020 m, y 0.0000 +- 0.0020 m, "
         "z 0.2000 +- 0.0020 m; probability 0.99)"
     )
-    chassis = {f"{axis}_Hz": (f, 0.01, "Hz") for axis, f in zip(("x", "y", "rx"), (14.0, 15.0, 22.0), strict=True)}
+    chassis = {
+        f"frequency_{axis}_Hz": (f, 0.01, "Hz") for axis, f in zip(("x", "y", "rx"), (14.0, 15.0, 22.0), strict=True)
+    }
     told = "frequency x 14.000 +- 0.010 Hz, y 15.000 +- 0.010 Hz, about x 22.000 +- 0.010 Hz; probability 0.99)"
     assert said(mass_kg=(8.0, 0.1, "kg"), **chassis).endswith(told)
     along = {f"direction_{axis}": (value, 0.01, "1") for axis, value in zip("xyz", (0.0, 0.0, 1.0), strict=True)}
