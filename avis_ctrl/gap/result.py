@@ -12,16 +12,16 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.priors import Tolerance
-from avis_ctrl.rigs.rigid_body import COORDINATES
 
 Verdict = Literal["none", "explained", "partly explained", "unexplained"]
 VERDICTS: tuple[str, ...] = get_args(Verdict)
 
 
 def spoken(name: str, unit: str) -> str:
-    """A parameter's name without its unit, which follows the number."""
+    """A parameter's name without its unit, which follows the number; of a rotation, "about" its axis."""
     tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
-    return (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
+    words = (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
+    return re.sub(r"\br([xyz])$", r"about \1", words)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +68,8 @@ class NamedEffect:
         for name, p in self.parameters.items():
             if not name.startswith("uneven_"):
                 words = spoken(name, p.unit)
-                stem, _, axis = words.rpartition(" ") if words[-2:].strip() in COORDINATES[:3] else (words, "", "")
-                # A resonance along (x) or about (rx) an axis.
-                if p.unit == "Hz" and (of := re.fullmatch("(r?)([xyz])", words)):
-                    stem, axis = "frequency", f"about {of[2]}" if of[1] else of[2]
+                of = re.fullmatch("(.*?) ?((about )?[xyz])", words)
+                stem, axis = (of[1], of[2]) if of else (words, "")
                 groups.setdefault(stem, []).append((axis, p))
         # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])
