@@ -147,10 +147,11 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     stiff = without_path_errors(base, data, settings)
     at_file = replace(tolerant, model=apart, z=priors.z(apart.values), variances=stiff.variances)
     step = restarted(stiff, at_file, tolerant, data, [*effects, *unnamed_faults().values()], prepared.run)
-    if step is None or step.fitted.log_evidence < found.best.log_evidence + settings.certain:
+    if step is None or step.fitted.log_evidence < tolerant.log_evidence + settings.certain:
         return found
     rivals = {**found.steps[0].tried, **step.tried} if found.steps else step.tried
-    return _searched(Fits(base, tolerant, (replace(step, tried=rivals),), step.fitted), prepared, effects)
+    again = _searched(Fits(base, tolerant, (replace(step, tried=rivals),), step.fitted), prepared, effects)
+    return again if again.best.log_evidence > found.best.log_evidence + settings.certain else found
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
