@@ -28,8 +28,8 @@ from avis_ctrl.gap.search import (
     forbidden,
     implausible,
     is_weak,
+    next_effect_from,
     outliers,
-    restarted,
     search,
     without_effect,
 )
@@ -46,7 +46,7 @@ from avis_ctrl.gap.tolerances import (
     with_tolerance,
 )
 from avis_ctrl.gap.validation import Power, halves, share_of
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods, without_path_errors
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
@@ -139,19 +139,27 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    found = _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
-    if credible(found.best, settings):
-        return found
-    # Values moved this far may imitate an effect; a search that begins with them begins with all values wrong.
+    fits = _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
+    if credible(fits.best, settings):
+        return fits
     progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
-    stiff = without_path_errors(base, data, settings)
-    at_file = replace(tolerant, model=apart, z=priors.z(apart.values), variances=stiff.variances)
-    step = restarted(stiff, at_file, tolerant, data, [*effects, *unnamed_faults().values()], prepared.run)
-    if step is None or step.fitted.log_evidence < tolerant.log_evidence + settings.certain:
-        return found
-    rivals = {**found.steps[0].tried, **step.tried} if found.steps else step.tried
-    again = _searched(Fits(base, tolerant, (replace(step, tried=rivals),), step.fitted), prepared, effects)
-    return again if again.best.log_evidence > found.best.log_evidence + settings.certain else found
+    return _searched_from(replace(tolerant, model=apart, z=priors.z(apart.values)), fits, prepared, effects)
+
+
+def _searched_from(at_file: Fitted, fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
+    """The better of two searches, the second of which starts from the values of the rig file.
+
+    Values that moved further than their tolerances allow may imitate an effect, and a search that starts from them
+    starts with all values wrong.
+    """
+    data, least = prepared.fit_data, prepared.run.settings.certain
+    step = next_effect_from(at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
+    if step is None or step.fitted.log_evidence < fits.tolerant.log_evidence + least:
+        return fits
+    rivals = {**fits.steps[0].tried, **step.tried} if fits.steps else step.tried
+    begun = replace(fits, steps=(replace(step, tried=rivals),), best=step.fitted)
+    again = _searched(begun, prepared, effects)
+    return again if again.best.log_evidence > fits.best.log_evidence + least else fits
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
@@ -160,6 +168,11 @@ def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits
     best = fits.best
     best = fit(best.model, best.priors, best.z, prepared.fit_data, best.variances, prepared.run.settings)
     return _searched(replace(fits, best=best), prepared, effects)
+
+
+def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
+    """The candidates, and the unnamed faults, which are fitted for comparison only."""
+    return [*effects, *unnamed_faults().values()]
 
 
 def _searched(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
@@ -172,8 +185,7 @@ def _searched(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits
         rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
         return rise < settings.trace * ground and rise < settings.minor * before
 
-    # The unnamed faults are fitted for comparison only.
-    steps = search(fits.best, data, [*effects, *unnamed_faults().values()], prepared.run, enough)
+    steps = search(fits.best, data, _with_unnamed(effects), prepared.run, enough)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
@@ -289,16 +301,16 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     """Assemble the result; stages, maps and sentences are computed on held-out records."""
     blocks, updated, settings, progress = prepared.held_out, names.updated, prepared.run.settings, prepared.run.progress
     before, after = ModelResidual.of(fits.base.model, blocks), ModelResidual.of(updated.model, blocks)
-    raw, tolerant = ModelResidual.of(fits.base.model, prepared.unmasked), fits.tolerant.model
+    raw = ModelResidual.of(fits.base.model, prepared.unmasked)
     noise = after.noise_nrmse**2
     power = Power(noise, before.nrmse**2)
     stages = [
         Stage("nominal", *_figures(ModelResidual.of(with_second_order(prepared.nominal), prepared.unmasked))),
         Stage("re-identified", *_figures(raw)),
-        Stage("tolerances", *_figures(ModelResidual.of(tolerant, prepared.unmasked))),
+        Stage("tolerances", *_figures(ModelResidual.of(fits.tolerant.model, prepared.unmasked))),
     ]
     if prepared.faults.hum is not None:
-        stages.append(Stage("mains_hum", *_figures(ModelResidual.of(tolerant, blocks))))
+        stages.append(Stage("mains_hum", *_figures(ModelResidual.of(fits.tolerant.model, blocks))))
     stages += [
         Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
         for label, one in _chain(fits, updated, prepared)

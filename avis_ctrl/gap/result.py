@@ -68,8 +68,8 @@ class NamedEffect:
         for name, p in self.parameters.items():
             if not name.startswith("uneven_"):
                 words = spoken(name, p.unit)
-                of = re.fullmatch("(.*?) ?((about )?[xyz])", words)
-                stem, axis = (of[1], of[2]) if of else (words, "")
+                of = re.fullmatch("(?:(.*?) )?((?:about )?[xyz])", words)
+                stem, axis = (of[1] or "", of[2]) if of else (words, "")
                 groups.setdefault(stem, []).append((axis, p))
         # Of these all components are given, also those that are zero.
         direction, position = groups.pop("direction", []), groups.pop("", [])

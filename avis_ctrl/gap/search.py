@@ -286,14 +286,41 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
 
 def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough."""
+    tried, count = _compared(without_path_errors(now, data, run.settings), now, data, effects, run)
+    return _with_best(now, tried, count, data, run.settings) if tried else None
+
+
+def next_effect_from(
+    start: Fitted, base: Fitted, now: Fitted, data: Data, effects: Sequence[Effect], run: Run
+) -> Step | None:
+    """As `next_effect`, where the fit `now` has moved the values of the rig file too far. Effects are searched beside a
+    fit `base` with fixed tolerances; the fits of all parameters start from `start`, with the rig file's values.
+    """
+    begun = without_path_errors(base, data, run.settings)
+    found, count = _compared(begun, begun, data, effects, run)
+    start = replace(start, variances=begun.variances)
+    tried = _likelier(_joint_fits(start, [one.model.effects[-1] for one in found.values()], data, run))
+    return _with_best(now, tried, count, data, run.settings) if tried else None
+
+
+def _with_best(now: Fitted, tried: dict[str, Fitted], count: int, data: Data, settings: GapSettings) -> Step:
+    """The step with the effect of the largest evidence, fitted to the end."""
+    best = tried[_likeliest(tried)]
+    return Step(now.bare(), fit(best.model, best.priors, best.z, data, best.variances, settings), tried, count)
+
+
+def _compared(
+    begun: Fitted, now: Fitted, data: Data, effects: Sequence[Effect], run: Run
+) -> tuple[dict[str, Fitted], int]:
+    """Fits of the best candidates by label, and the number of candidates; no fits if none improves the fit `now`
+    enough. begun : the same fit with minimum path errors, from which they start."""
     settings = run.settings
-    begun = without_path_errors(now, data, settings)
     found = candidates(begun, data, effects, run)
     short = shortlist(found, settings)
     run.progress(f"  {len(found)} candidates by their first-order gain, of which {len(short)} are fitted")
     tried = _tried(begun, short, data, run)
     if not tried:
-        return None
+        return {}, len(found)
     better, best, asked = tried, _likeliest(tried), set(tried)
     while better:
         least = begun.log_evidence + settings.near_best * (tried[best].log_evidence - begun.log_evidence)
@@ -311,28 +338,8 @@ def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) ->
             if label not in before
             or (label == best and one.log_evidence - before[label].log_evidence > settings.certain)
         }
-    start = tried[best]
-    if start.log_evidence - now.log_evidence < settings.certain + math.log(max(len(found), len(tried))):
-        return None
-    full = fit(start.model, start.priors, start.z, data, start.variances, settings)
-    return Step(now.bare(), full, tried, len(found))
-
-
-def restarted(base: Fitted, start: Fitted, now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> Step | None:
-    """The effect with the largest evidence in fits that start with the values of the rig file; None if there is none.
-
-    base : the fit whose tolerances are fixed, beside which the effects are searched. start : model, priors, values and
-    variances with which the fits of all parameters start. now : the fit before the step.
-    """
-    step = next_effect(base, data, effects, run)
-    if step is None:
-        return None
-    tried = _likelier(_joint_fits(start, [one.model.effects[-1] for one in step.tried.values()], data, run))
-    if not tried:
-        return None
-    best = tried[_likeliest(tried)]
-    full = fit(best.model, best.priors, best.z, data, best.variances, run.settings)
-    return Step(now.bare(), full, tried, step.candidates)
+    rise = tried[best].log_evidence - now.log_evidence
+    return (tried if rise >= settings.certain + math.log(max(len(found), len(tried))) else {}), len(found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -264,8 +264,8 @@ def fit(
 ) -> Fitted:
     """Alternate Gauss-Newton steps in z with estimates of the variances.
 
-    Only the distortion is estimated until the log-likelihood settles, then the path errors, too: they would otherwise
-    explain what the parameters explain after a few more steps.
+    Until the log-likelihood settles, only the distortion is estimated, then the path errors, too. Otherwise path errors
+    would explain at once what the parameters explain after a few more steps.
     """
     steps, best, noise, released = 0, None, mean_noise(data.blocks, data.levels, settings), False
     model = model.at(priors.values(z))

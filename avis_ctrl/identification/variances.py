@@ -15,7 +15,8 @@ and only sums over the lines of a level enter: G_l^H G_l, G_l^H e_l and |e_l|^2.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,10 +78,11 @@ def log_prior(variances: Variances, noise: Mapping[Group, np.ndarray], settings:
     return sum(float(np.sum(-half * (np.log(value) + least / value))) for value, least in pairs)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """Of n bands and sensors: M (n, L, k, k) G^H G, p (n, L, k) G^H e, q (n, L) |e|^2 and number of lines (n, L) by
-    level, zero for a level without lines; noise (n, L)."""
+class _Sums(NamedTuple):
+    """Sums over the lines of each level, for n pairs of band and sensor; zero for a level without lines.
+
+    M : (n, L, k, k) G^H G. p : (n, L, k) G^H e. q : (n, L) |e|^2. lines : (n, L) their number. noise : (n, L) mean.
+    """
 
     M: np.ndarray
     p: np.ndarray
@@ -88,8 +90,9 @@ class _Sums:
     lines: np.ndarray
     noise: np.ndarray
 
-    def __getitem__(self, at: np.ndarray) -> _Sums:
-        return _Sums(*(getattr(self, one.name)[at] for one in fields(self)))
+    def some(self, at: np.ndarray) -> _Sums:
+        """Some of the bands and sensors."""
+        return _Sums(*(one[at] for one in self))
 
     def path_errors(self, theta: np.ndarray) -> tuple[np.ndarray, ...]:
         """d (n, L), K (n, k, k), b (n, k), x (n, k), and the power (n, L) that x leaves, at theta = log (v, s)."""
@@ -122,7 +125,7 @@ def estimated(
     maximum near the old variances of the distortion.
 
     The likelihood has several maxima: path errors may explain the residual of one level while all of another is
-    distortion. So the search starts from several such divisions and from the old variances, and the best end counts.
+    distortion. The search therefore starts from several such divisions and from the old variances; the best end counts.
     """
     noise = mean_noise(blocks, levels, settings)
     row = {band: k for k, band in enumerate(sorted({band for _, band in noise}))}
@@ -157,9 +160,7 @@ def estimated(
 
 def _most_likely(sums: _Sums, old: np.ndarray, settings: FitSettings, hold_path: bool) -> np.ndarray:
     """theta = log (v, s) (n, 1 + L) of the highest maximum; with `hold_path`, of the one near the old values."""
-    least = np.concatenate(
-        [np.full((len(old), 1), settings.least_error**2), settings.least_distortion * sums.noise], axis=1
-    )
+    least = np.hstack([np.full((len(old), 1), settings.least_error**2), settings.least_distortion * sums.noise])
     starts = [old, *(() if hold_path else _starts(sums, np.log(least)))]
     ends = [_descent(sums, start, least, settings, hold_path) for start in starts]
     best = np.argmin([cost for _, cost in ends], axis=0)
@@ -176,18 +177,18 @@ def _starts(sums: _Sums, least: np.ndarray) -> Iterator[np.ndarray]:
 
     def explained(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """log v (n, 1) of the path errors that explain as much as they can under distortion s, and what they leave."""
-        *_, x, left = sums.path_errors(np.concatenate([np.zeros((len(s), 1)), s], axis=1))
+        *_, x, left = sums.path_errors(np.hstack([np.zeros((len(s), 1)), s]))
         size = np.log(np.mean(np.abs(x) ** 2, axis=1, keepdims=True) + np.finfo(float).tiny)
         return np.maximum(size, least[:, :1]), left
 
     whole = distortion(sums.q)
-    yield np.concatenate([least[:, :1], whole], axis=1)
+    yield np.hstack([least[:, :1], whole])
     for level in range(whole.shape[1]):
         s = whole.copy()
         s[:, level] = least[:, 1 + level]
-        yield np.concatenate([explained(s)[0], s], axis=1)
+        yield np.hstack([explained(s)[0], s])
     v, left = explained(least[:, 1:])
-    yield np.concatenate([v, distortion(left)], axis=1)
+    yield np.hstack([v, distortion(left)])
 
 
 def _descent(
@@ -202,7 +203,7 @@ def _descent(
         M = H * (1 + damping[:, None, None] * eye)
         step = -np.linalg.solve(M, g[..., None])[..., 0]
         trial = theta[moving] + np.clip(step, -settings.longest_step, settings.longest_step)
-        own, g_new, H_new = _expanded(sums[moving], trial, least[moving], settings, hold_path)
+        own, g_new, H_new = _expanded(sums.some(moving), trial, least[moving], settings, hold_path)
         lower = own < cost[moving]
         theta[moving[lower]], cost[moving[lower]] = trial[lower], own[lower]
         kept = -np.sum(step * g, axis=1) > settings.variance_settled
@@ -245,7 +246,7 @@ def _expanded(
     level = np.arange(1, theta.shape[1])
     H[:, level, level] += r**2 * (sums.lines - 2 * trace)
     below = least * np.exp(-theta)
-    exists = np.concatenate([np.ones_like(v), sums.lines > 0], axis=1)
+    exists = np.hstack([np.ones_like(v), sums.lines > 0])
     cost += half * np.sum(exists * (theta + below), axis=1)
     g += half * exists * (1 - below)
     parameter = np.arange(theta.shape[1])

@@ -212,15 +212,19 @@ def require_contract(told):
     answer = parse(json.dumps(told, allow_nan=False), Answer)
     for one in (*answer.effects, *(Named.model_validate(trace) for trace in told["traces"])):
         assert one.name not in one.indistinguishable_from and one.parameters
+        assert all(value.std is not None for value in one.parameters.values())
     stages = [one.stage for one in answer.gap]
     assert stages[:3] == ["nominal", "re-identified", "tolerances"]
     assert sorted(stages[3:]) == sorted(
         one["name"] for one in (*told["effects"], *told["traces"]) if one["name"] not in UNSTAGED
     )
+    assert all(one.nrmse > 0 and one.chi2_per_dof > 0 for one in answer.gap) and answer.seconds > 0
     assert sum(one.share for one in answer.where) < 1 + 1e-9
     assert all(0 <= one.from_Hz < one.to_Hz and 0 < one.share <= 1 for one in answer.where)
-    if told["verdict"] in ("none", "unexplained"):
-        assert not told["effects"]
+    if answer.verdict in ("none", "unexplained"):
+        assert not answer.effects
+    if answer.verdict == "none":
+        assert not answer.where
 
 
 def test_verdicts_are_the_contracts_words(shared):

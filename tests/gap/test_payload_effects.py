@@ -49,6 +49,8 @@ def test_the_sentence_gives_place_and_direction_also_where_they_are_zero():
         "y 15.000 +- 0.010 Hz, z 22.000 +- 0.010 Hz, position x 0.3000 +- 0.0020 m, y 0.0000 +- 0.0020 m, "
         "z 0.2000 +- 0.0020 m; probability 0.99)"
     )
+    product = said(Jxy_kgm2=(0.5, 0.01, "kg m^2"))  # no component of a vector
+    assert "Jxy 0.500 +- 0.010 kg m^2" in product
     chassis = {
         f"frequency_{axis}_Hz": (f, 0.01, "Hz") for axis, f in zip(("x", "y", "rx"), (14.0, 15.0, 22.0), strict=True)
     }

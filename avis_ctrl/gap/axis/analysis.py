@@ -51,9 +51,9 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
     refused: dict[str, str] = {}
     while True:
         names = [_name(best, one, explored) for one in best.model.effects if not one.outside]
-        if in_doubt := [one for one in names if one.refused]:
-            # The one that the data miss least goes first: the others are judged again without it.
-            worst = max(in_doubt, key=lambda one: explored.score_without(best, one.effect.label))
+        if in_doubt := {one.effect.label: one for one in names if one.refused}:
+            # The one that the data miss least is removed first; the others are judged again without it.
+            worst = in_doubt[explored.least_missed(best, list(in_doubt))]
             wrong = {worst.effect: worst.refused}
         elif better := _better_shape(best, explored):
             best, variable = better

@@ -112,10 +112,15 @@ class Explored:
         """Evidence of the fitted data plus log-likelihood of the held-out data."""
         return one.log_evidence + self.held_out(one)
 
-    def score_without(self, one: Fitted, label: str) -> float:
-        """Score of the fit without one of its effects; minus infinity if it did not converge."""
-        rest = self.without(one, label)
-        return -math.inf if rest is None else self.score(rest)
+    def least_missed(self, now: Fitted, labels: Sequence[str]) -> str:
+        """Label of the effect without which the score is largest. A fit without an effect that did not converge counts
+        as the lowest."""
+
+        def score(label: str) -> float:
+            rest = self.without(now, label)
+            return -math.inf if rest is None else self.score(rest)
+
+        return max(labels, key=score)
 
     def odds_against(self, one: Fitted, other: Fitted) -> float:
         """Odds of another fit against this one, by the evidence of the fitted data and the likelihood of the held-out
@@ -219,11 +224,10 @@ def _revised(now: Fitted, explored: Explored, laws_only: bool) -> Fitted:
 
 def _without_idle(now: Fitted, explored: Explored) -> Fitted:
     while len(now.labels) > 1:
-        rest = [one for label in now.labels if (one := explored.without(now, label)) is not None]
-        best = max(rest, key=explored.score, default=None)
-        if best is None or explored.score(best) < explored.score(now) - explored.settings.certain:
+        rest = explored.without(now, explored.least_missed(now, now.labels))
+        if rest is None or explored.score(rest) < explored.score(now) - explored.settings.certain:
             return now
-        now = best
+        now = rest
     return now
 
 
