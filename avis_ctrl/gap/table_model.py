@@ -246,12 +246,12 @@ class TableModel(Table):
         together with a constant and a slope. r^2 and s r^2 represent a small change of these poles, so that a fit's
         gradient need not include it. If the corners of geophones have tolerances, no filter cancels a suspension
         exactly and each suspension rings, with or without effects: 1/p and s/p, with p its polynomial, are then used
-        instead.
+        instead, beside the states that effects declare (`Operators.ringing`).
         """
         own, s = self.base.chains_ring(omega), 1j * omega
         if self.corners_differ:
             ring = self._chain_ratio(omega)[:, :, None] * self.base.suspensions_ring(omega)
-            return np.concatenate([own, ring], axis=2)
+            return np.concatenate([own, ring, *self._ringing(omega)], axis=2)
         changed = self._changed_sensors
         if not changed.size:
             return own
@@ -260,6 +260,15 @@ class TableModel(Table):
         for j, k in enumerate(changed):
             ringing[:, k, j] = np.stack([r[:, k], s * r[:, k], r[:, k] ** 2, s * r[:, k] ** 2], axis=-1)
         return np.concatenate([own, ringing.reshape(len(omega), r.shape[1], -1)], axis=2)
+
+    def _ringing(self, omega: np.ndarray) -> list[np.ndarray]:
+        """(n, n_y, m) y per unit initial value of the states that effects add to sensors' chains."""
+        found = []
+        for k, states in self.assembled(omega).ops.ringing:
+            of_all = np.zeros((len(omega), len(self.sensors.names), states.shape[1]), complex)
+            of_all[:, k] = states
+            found.append(of_all)
+        return found
 
     @cached_property
     def _changed_sensors(self) -> np.ndarray:

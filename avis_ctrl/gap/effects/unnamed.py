@@ -152,8 +152,9 @@ class SensorResonance(OfSensor, UnnamedFault):
         )
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        shape = ops.s**2 * receptance(ops.s, values["frequency_Hz"], values["damping"])
-        ops.sense[:, ops.sensor(place)] *= 1 + values["share"] * shape
+        k, mode = ops.sensor(place), receptance(ops.s, values["frequency_Hz"], values["damping"])
+        ops.ringing.append((k, np.stack([mode, ops.s * mode], axis=1)))
+        ops.sense[:, k] *= 1 + values["share"] * ops.s**2 * mode
 
 
 class QuadraticStiffness(UnnamedFault, CubicStiffness):
