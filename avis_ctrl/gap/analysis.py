@@ -16,6 +16,7 @@ from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed import unnamed_faults
+from avis_ctrl.gap.line_response import forget
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
 from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
@@ -108,6 +109,7 @@ def analyse(
     if prepared.clipped is not None and fits.steps:
         progress("clipped samples: replaced by the prediction of the model with its effects")
         prepared = mended_with(prepared, fits.best.model)
+        del fits  # with the motion in every record, which takes much memory
         fits = _fits(prepared, rig, known)
     residual = ModelResidual.of(fits.best.model, prepared.held_out)
     if prepared.local_noise and residual.noise_nrmse**2 > settings.within_noise * residual.nrmse**2:
@@ -139,7 +141,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    fits = _searched(Fits(base, tolerant, (), tolerant), prepared, effects)
+    fits = _searched(Fits(base, tolerant.bare(), (), tolerant), prepared, effects)
     if credible(fits.best, settings):
         return fits
     progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
@@ -332,6 +334,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     if after.chi2_per_dof <= settings.known_noise:
         progress("noise of floor and sensors")
         residual = time_residuals(prepared.campaign, updated.model, prepared.run.each)
+        forget()
         faults = replace(faults, noise=levels(residual, updated.model, faults.hum, faults.converter))
     found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
@@ -354,7 +357,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     limits: tuple[Detectable, ...] = ()
     if verdict == "none":
         progress("detection limits of the effects")
-        limits = detection_limits(EvidenceScore(fits.tolerant, prepared.fit_data, settings), effects)
+        limits = detection_limits(EvidenceScore(updated, prepared.fit_data, settings), effects)
     sentences = (
         _opening(verdict, reported, traces, stages, remainder, after),
         imitated,

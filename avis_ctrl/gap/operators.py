@@ -90,8 +90,8 @@ class Operators:
         sensitivity.
     sensor_gain : (n_y,) factors. drive : (n, n_u) factors of the volts. delay_s, amplifier_corner_Hz : of the drives.
     inner : (n, 6, m) forces on q due to unit impulses on internal states of effects. decays : the same for first-order
-        states, which need impulses only. ringing : index of a sensor, and (n, m) its output due to unit initial values of
-        states that an effect adds to its chain.
+        states, which need impulses only. ringing : index of a sensor, and (n, m) its output due to unit initial values
+        of states that an effect adds to its chain.
     added : coordinates in addition to the six. recoil, follow : (n, 6, 6) B and (n, 6, 3) H_w, None for a stiff floor.
     """
 

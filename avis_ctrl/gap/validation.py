@@ -83,9 +83,9 @@ def halves(
     absent = absent or {}
     effect = _departure(fitted, absent)
     away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
-    found = []
+    found, whole = [], fitted.J
     for words, at in _parts(fitted, rows) if parts is None else parts:
-        J, e = fitted.J[:, at], fitted.e[at]
+        J, e = whole[:, at], fitted.e[at]
         P = np.linalg.inv(J @ J.T + np.eye(len(J)))
         step = np.linalg.solve(root, (P @ (J @ e - fitted.z))[rows])
         # Variances of the half over those of the whole; directions that the half hardly determines are left out.

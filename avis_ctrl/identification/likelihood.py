@@ -84,9 +84,9 @@ class Fitted:
         """(N,) residual, with the path errors integrated out."""
         return self.weights.flatten(self.white.e[None])[0]
 
-    @cached_property
+    @property
     def J(self) -> np.ndarray:
-        """(n, N) negative derivative of `e` by z."""
+        """(n, N) negative derivative of `e` by z; not cached, because it is large."""
         return self.weights.flatten(self.white.J)
 
     @property

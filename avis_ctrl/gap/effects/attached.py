@@ -167,7 +167,7 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
 
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
-        return *_best_triple(np.einsum("ap,fpgq,bq->fagb", rows, G, rows, optimize=True), b @ rows.T), point
+        return *_best_triple(_at_place(G, rows), b @ rows.T), point
 
     starts = sorted((at(point) for point in points), key=lambda one: -one[0])[: SETTINGS.followed_places]
     found = []
@@ -191,8 +191,8 @@ def _along_the_others(
     G, b = _at_frequencies(score, frequencies, damping)
     best = -np.inf, (0, 0), points[0]
     for rows, point in zip(at_points(points, axes), points, strict=True):
-        H, g = np.einsum("ap,fpgq,bq->afbg", rows, G, rows, optimize=True), rows @ b.T
-        one, other, both = np.diag(H[0, :, 0])[:, None], np.diag(H[1, :, 1]), H[0, :, 1]
+        H, g = _at_place(G, rows), rows @ b.T
+        one, other, both = np.diag(H[:, 0, :, 0])[:, None], np.diag(H[:, 1, :, 1]), H[:, 0, :, 1]
         size = one * other - both**2
         masses = np.array([other * g[0][:, None] - both * g[1], one * g[1] - both * g[0][:, None]]) / size
         reduced = np.where(np.all(masses > 0, axis=0), masses[0] * g[0][:, None] + masses[1] * g[1], 0.0)
@@ -205,11 +205,17 @@ def _at_frequencies(
     score: Score, frequencies: Sequence[float] | np.ndarray, damping: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n, 21, n, 21) Gram matrix of the unit matrices at each frequency, and (n, 21) product with the residual."""
-    kept = np.concatenate(
-        [unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping)) for f in frequencies], dtype=np.float32
-    )
     n = len(frequencies)
+    kept = np.empty((21 * n, len(score.e)), np.float32)  # large; filled one by one to limit memory
+    for k, f in enumerate(frequencies):
+        kept[21 * k : 21 * (k + 1)] = unit_matrices(score, partial(sprung, frequency_Hz=f, damping=damping))
     return (kept @ kept.T).reshape(n, 21, n, 21), (kept @ score.e.astype(np.float32)).reshape(n, 21)
+
+
+def _at_place(G: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """(n, k, n, k) Gram matrix of a mass at one place, moving along k axes; G as of `_at_frequencies`, rows (k, 21)."""
+    n, k, own = len(G), len(rows), rows.astype(G.dtype)  # otherwise G, which is large, would be copied
+    return ((own @ G.reshape(n, 21, -1)).reshape(n, k, n, 21) @ own.T).astype(float)
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:

@@ -30,6 +30,7 @@ class QuietLineSettings:
         below, its level depends on the model of the window.
     rounds : iterations in which records are weighted by their noise: louder records must not spoil the others.
     smoothed : number of windows over which that weight is averaged.
+    at_once : number of windows whose regressions are computed together, to limit memory.
     outlier : power of a line over the median of its window above which it is not noise [1]: exponential noise exceeds
         it with probability 1e-12.
     """
@@ -41,6 +42,7 @@ class QuietLineSettings:
     least_left: float = 0.2
     rounds: int = 2
     smoothed: int = 9
+    at_once: int = 32
     outlier: float = 40.0
 
 
@@ -129,7 +131,9 @@ def _regression(residuals: Sequence[RecordResidual], keep: Sequence[np.ndarray],
     # Records that clip or distort are louder: weighted by their residual, they do not spoil the others.
     for _ in range(SETTINGS.rounds):
         weight = np.where(lines_of_noise, 1 / size[:, :, None], 1e-4 / size[:, :, None]).reshape(blocks, -1)
-        rest, share = _residual(A, E, weight, R)
+        some = [slice(start, start + SETTINGS.at_once) for start in range(0, blocks, SETTINGS.at_once)]
+        parts = [_residual(A[one], E[one], weight[one], R) for one in some]
+        rest, share = (np.concatenate(one) for one in zip(*parts, strict=True))
         line = np.sum(np.abs(rest) ** 2, axis=3)
         # Machine or mains lines would otherwise be spread over their window.
         lines_of_noise &= line <= SETTINGS.outlier * np.median(line, axis=2, keepdims=True)
