@@ -22,7 +22,7 @@ from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise
 from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
-from avis_ctrl.gap.run import Mapper, Progress, Run, sequential_map
+from avis_ctrl.gap.run import Mapper, Progress, Run, between_stages, sequential_map
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.search import (
     backward_elimination,
@@ -103,6 +103,7 @@ def analyse(
     InputError : no record drives an actuator, or the noise cannot be estimated.
     """
     began = time.monotonic()
+    progress = between_stages(progress)
     prepared = prepare(campaign, rig, band_Hz, amplifier_corner_Hz, Run(settings, progress, each))
     known = list(library().values()) if effects is None else list(effects)
     fits = _fits(prepared, rig, known)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -24,6 +26,17 @@ class Mapper(Protocol):
 def sequential_map(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Run the calculations one after the other."""
     return [function(item) for item in items]
+
+
+def between_stages(progress: Progress) -> Progress:
+    """Report progress and return freed memory to the operating system: glibc keeps some hundred MB of it otherwise."""
+
+    def reported(text: str) -> None:
+        with contextlib.suppress(OSError, AttributeError, TypeError):  # only glibc has this function
+            ctypes.CDLL(None).malloc_trim(0)
+        progress(text)
+
+    return reported
 
 
 @dataclass(frozen=True)
