@@ -13,6 +13,7 @@ import numpy as np
 from avis_ctrl.checks import require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.geophone_catalogue import check_against_name, read_response
+from avis_ctrl.rigs.instruments import Tolerances
 from avis_ctrl.rigs.key_types import LIMITS
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
@@ -114,6 +115,11 @@ def rig_text(new: NewRig) -> str:
         f"loop_delay_s = {1 / new.sample_rate_Hz:g}                 # assumed: one sample\n"
         "\n[ambient]\nfloor_velocity_rms_m_per_s = 2e-6    # assumed: a quiet laboratory\n"
         "sensor_noise_rms_V = 0.001           # assumed\n"
+        "\n# How accurately the values above are known: standard deviations for avis identify and avis gap.\n"
+        "[tolerances]\n"
+        + "".join(f"{f'{one.name} = {one.default:g}':36} # assumed\n" for one in fields(Tolerances))
+        + "\n# If there is an analogue anti-alias filter (Butterworth) before the converter:\n"
+        f"# [electronics]\n# anti_alias_order = 4\n# anti_alias_corner_Hz = {new.sample_rate_Hz / 4:g}\n"
     )
 
 
