@@ -78,7 +78,7 @@ _ELSEWHERE = {
     "umat": "matrix",
     "uss": "ss",
     "robstab": "robust_stability",
-    "robgain": "robust_performance",
+    "robustperf": "robust_performance",
     "wcgain": "worst_case_gain",
     "mussv": "mu or mu_peak",
     "mixsyn": "mixed_sensitivity",
