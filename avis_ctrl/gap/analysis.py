@@ -19,7 +19,7 @@ from avis_ctrl.gap.effects.unnamed import unnamed_faults
 from avis_ctrl.gap.line_response import forget
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
-from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of
+from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of, probability_of_rival
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.run import Mapper, Progress, Run, between_stages, sequential_map
@@ -47,7 +47,7 @@ from avis_ctrl.gap.tolerances import (
     with_tolerance,
 )
 from avis_ctrl.gap.validation import Power, halves, share_of
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihoods
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
@@ -155,9 +155,12 @@ def _searched_from(at_file: Fitted, fits: Fits, prepared: Prepared, effects: Seq
     Values that moved further than their tolerances allow may imitate an effect, and a search that starts from them
     starts with all values wrong.
     """
-    data, least = prepared.fit_data, prepared.run.settings.certain
+    data = prepared.fit_data
     step = next_effect_from(at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
-    if step is None or step.fitted.log_evidence < fits.tolerant.log_evidence + least:
+    if step is None:
+        return fits
+    least = prepared.run.settings.certain + math.log(step.candidates)
+    if step.fitted.log_evidence < fits.tolerant.log_evidence + least:
         return fits
     rivals = {**fits.steps[0].tried, **step.tried} if fits.steps else step.tried
     begun = replace(fits, steps=(replace(step, tried=rivals),), best=step.fitted)
@@ -292,7 +295,7 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
 
     def likelihood(one: Fitted) -> float:
         # With the priors: a value beyond its tolerance shows in how far other values had to move, hardly in a residual.
-        return sum(log_likelihoods(one, held, settings).values()) - 0.5 * float(one.z @ one.z)
+        return log_likelihood(one, held, settings) - 0.5 * float(one.z @ one.z)
 
     if likelihood(step.fitted) > likelihood(step.before):
         return True
@@ -470,8 +473,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
     """Effects that were fitted but not named, the most probable first."""
     rows, thin, settings = [], prepared.held_data.blocks, prepared.run.settings
     for number, step in enumerate(fits.steps, 1):
-        best = max(step.tried.values(), key=lambda one: one.log_evidence)
-        top = best.log_evidence
+        top = max(one.log_evidence for one in step.tried.values())
         for label, one in sorted(step.tried.items(), key=lambda item: -item[1].log_evidence):
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
@@ -488,7 +490,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
                     effect.effect.name,
                     name_of(label)[1],
                     chi2,
-                    min(odds_against_fit(best, one), settings.most_sure),
+                    min(probability_of_rival(step, label, settings), settings.most_sure),
                     reason,
                     reported,
                 )

@@ -67,6 +67,20 @@ def odds_against_fit(one: Fitted, other: Fitted) -> float:
     return larger_odds(mine, theirs, beside)
 
 
+def prior_odds(fitted: Fitted, label: str, settings: GapSettings) -> float:
+    """Prior odds of an effect of a fit against one of the library."""
+    return 1 / settings.outside_odds if fitted.model.effect(label).outside else 1.0
+
+
+def probability_of_rival(step: Step, label: str, settings: GapSettings) -> float:
+    """Probability of one of the fits that were tried in a step (`probability_of`)."""
+    own, mine, one = probability_of(step, settings)[0], step.tried[step.label], step.tried[label]
+    if label == step.label:
+        return own
+    prior = prior_odds(one, label, settings) / prior_odds(mine, step.label, settings)
+    return min(own * odds_against_fit(mine, one) * prior, 1 - own)
+
+
 def probability_of(
     step: Step, settings: GapSettings, odds_against: Callable[[Fitted, Fitted], float] = odds_against_fit
 ) -> tuple[float, tuple[str, ...]]:
@@ -74,11 +88,12 @@ def probability_of(
     Effects without a name in the library have a lower prior probability. odds_against : odds of the second fit against
     the first."""
     own, mine = name_of(step.label), step.tried[step.label]
-    odds = {("", ""): odds_against(mine, step.before)}
+    prior = prior_odds(mine, step.label, settings)
+    odds = {("", ""): odds_against(mine, step.before) / prior}
     for label, one in step.tried.items():
         if name_of(label) != own:
-            outside = settings.outside_odds if one.model.effects[-1].outside else 1.0
-            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), odds_against(mine, one) / outside)
+            own_odds = odds_against(mine, one) * prior_odds(one, label, settings) / prior
+            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), own_odds)
     probability = 1 / (1 + sum(odds.values()))
     rivals = [
         name

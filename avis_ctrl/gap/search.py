@@ -20,7 +20,7 @@ import numpy as np
 from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
-from avis_ctrl.gap.probability import Step, name_of, probability_of
+from avis_ctrl.gap.probability import Step, name_of, prior_odds, probability_of
 from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import GapSettings
@@ -225,7 +225,7 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
             continue
         best = steps[-1].fitted
         again = _again(step, best, data, settings)
-        label = _likeliest(again.tried)
+        label = _likeliest(again.tried, settings)
         if again.tried[label].log_evidence - best.log_evidence < settings.certain:
             steps[k] = again
             continue
@@ -305,7 +305,7 @@ def next_effect_from(
 
 def _with_best(now: Fitted, tried: dict[str, Fitted], count: int, data: Data, settings: GapSettings) -> Step:
     """The step with the effect of the largest evidence, fitted to the end."""
-    best = tried[_likeliest(tried)]
+    best = tried[_likeliest(tried, settings)]
     return Step(now.bare(), fit(best.model, best.priors, best.z, data, best.variances, settings), tried, count)
 
 
@@ -321,9 +321,9 @@ def _compared(
     tried = _tried(begun, short, data, run)
     if not tried:
         return {}, len(found)
-    better, best, asked = tried, _likeliest(tried), set(tried)
+    better, best, asked = tried, _likeliest(tried, settings), set(tried)
     while better:
-        least = begun.log_evidence + settings.near_best * (tried[best].log_evidence - begun.log_evidence)
+        least = now.log_evidence + settings.near_best * (tried[best].log_evidence - now.log_evidence)
         rivals = [label for label, one in tried.items() if one.log_evidence >= least]
         further = [*extensions(list(better.values()), data, settings), *other_laws(found, rivals, asked)]
         asked |= {one.effect.label for one in further}
@@ -331,7 +331,7 @@ def _compared(
             run.progress(f"  {len(further)} more forms of the best candidates are fitted")
         more, before = _tried(begun, further, data, run), tried
         tried = _likelier([*before.values(), *more.values()])
-        best = _likeliest(tried)
+        best = _likeliest(tried, settings)
         better = {
             label: one
             for label, one in more.items()
@@ -421,9 +421,9 @@ def _likelier(fits: Sequence[Fitted]) -> dict[str, Fitted]:
     return found
 
 
-def _likeliest(fits: Mapping[str, Fitted]) -> str:
-    """Label of the fit with the largest evidence."""
-    return max(fits, key=lambda label: fits[label].log_evidence)
+def _likeliest(fits: Mapping[str, Fitted], settings: GapSettings) -> str:
+    """Label of the most probable fit: evidence, and prior odds of effects that are not in the library."""
+    return max(fits, key=lambda label: fits[label].log_evidence + math.log(prior_odds(fits[label], label, settings)))
 
 
 def at_full_strength(one: ActiveEffect) -> bool:

@@ -20,7 +20,7 @@ from avis_ctrl.rigs.instruments import Tolerances
 
 Stated = Callable[[Tolerances, Sequence[EffectParameter]], tuple[float, ...]]
 # Effects that represent one value of the rig file beyond its tolerance: the tolerance of each of their parameters, in
-# its unit, and the prefixes of the names of these tolerances.
+# its unit, and the names of these tolerances; a name that ends in "." or "_" is the start of several.
 BEYOND: Mapping[str, tuple[Stated, tuple[str, ...]]] = {
     "sensor_gain": (lambda t, p: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
     "actuator_gain": (lambda t, p: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
@@ -57,7 +57,8 @@ def tolerances_behind(effect: ActiveEffect, names: Sequence[str]) -> list[int]:
     """Indices of the tolerances of the values that an effect of `BEYOND` represents."""
     _, starts = BEYOND.get(effect.effect.name, (None, ()))
     own = tuple(start.format(place=effect.place, product=PRODUCTS.get(effect.place)) for start in starts)
-    return [k for k, name in enumerate(names) if name.startswith(own) and "@" not in name]
+    several = tuple(one for one in own if one.endswith((".", "_")))
+    return [k for k, name in enumerate(names) if (name in own or name.startswith(several)) and "@" not in name]
 
 
 def rescaled(priors: Priors, effect: ActiveEffect, factor: float) -> Priors:

@@ -128,8 +128,10 @@ def _parts(fitted: Fitted, rows: Sequence[int]) -> list[tuple[str, np.ndarray]]:
 
 def by_information(values: np.ndarray, information: np.ndarray, *words: str) -> list[tuple[str, np.ndarray]]:
     """Names and rows of the half with low and of that with high values (N,), each with about half of the information
-    (N,); empty if the values cannot be divided."""
-    _, place = np.unique(values, return_inverse=True)
+    (N,); empty if all values are equal."""
+    distinct, place = np.unique(values, return_inverse=True)
+    if len(distinct) == 1:
+        return []
     total = np.cumsum(np.bincount(place, information))
-    low = (total <= total[-1] / 2)[place]
-    return [(words[0], np.flatnonzero(low)), (words[1], np.flatnonzero(~low))] if low.any() else []
+    low = place <= np.argmin(np.abs(total[:-1] - total[-1] / 2))
+    return [(words[0], np.flatnonzero(low)), (words[1], np.flatnonzero(~low))]

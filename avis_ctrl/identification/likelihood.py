@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
-from avis_ctrl.identification.maximum_likelihood import block_residual, transient_unknowns
+from avis_ctrl.identification.maximum_likelihood import block_residual, price_of_transient
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -141,11 +141,13 @@ class Fitted:
         if not len(self.white.e):
             return self.covariance, self.covariance
 
+        J = self.J
+
         def robust(parts: Sequence[Sequence[Group]]) -> np.ndarray:
             rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
             if len(rows) == 1:
                 return self.covariance
-            moves = cluster_moves(self.covariance, self.J, self.e, rows, self.settings.least_elsewhere)
+            moves = cluster_moves(self.covariance, J, self.e, rows, self.settings.least_elsewhere)
             return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
 
         by_octave, by_level = clusterings(list(self.weights.rows), self.settings.bands_per_octave)
@@ -291,7 +293,7 @@ def fit(
     assert best is not None
     reached, at, weights, variances = best
     H = at.H + np.eye(len(at.z))
-    log_evidence = reached - _price_of_ends(at.model, data) - 0.5 * np.linalg.slogdet(H)[1]
+    log_evidence = reached - _price_of_ends(at.model, data, weights) - 0.5 * np.linalg.slogdet(H)[1] - priors.log_inside
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
     # By eigenvalues: with poorly determined directions, round-off makes `inv` neither symmetric nor positive definite.
     size, vectors = np.linalg.eigh(H)
@@ -330,10 +332,9 @@ def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETT
     return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
 
 
-def _price_of_ends(model: Any, data: Data) -> float:
-    """Cost of the states at the ends of records, which have no prior: that of a unit-information prior each (Schwarz
-    1978)."""
-    return sum(0.5 * transient_unknowns(block, model) * np.log(2 * block.Y.size) for block in data.blocks)
+def _price_of_ends(model: Any, data: Data, weights: Weights) -> float:
+    """`price_of_transient` of all blocks."""
+    return sum(price_of_transient(model, block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True))
 
 
 class Profile:
@@ -354,6 +355,10 @@ class Profile:
         rows = self.fitted.weights.flatten(white)
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
+
+    @cached_property
+    def _price_of_ends(self) -> float:
+        return _price_of_ends(self.fitted.model, self.data, self.fitted.weights)
 
     @cached_property
     def _white_basis(self) -> np.ndarray:
@@ -384,13 +389,15 @@ class Profile:
         end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
         gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
-        gain += _price_of_ends(self.fitted.model, self.data) - _price_of_ends(end.model, self.data)
+        gain += self._price_of_ends - _price_of_ends(end.model, self.data, weights) - priors.log_inside
         return end.z, gain, fall
 
 
-def log_likelihoods(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> dict[Group, float]:
-    """Log-likelihoods of records that were not fitted, by level and band, with the fitted parameters and variances."""
-    return _by_group(*unseen(fitted, data, settings))
+def log_likelihood(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> float:
+    """Log-likelihood of records that were not fitted, with the fitted parameters and variances. The states at the
+    records' ends are integrated out."""
+    weights, flat = unseen(fitted, data, settings)
+    return sum(_by_group(weights, flat).values()) - _price_of_ends(fitted.model, data, weights)
 
 
 def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tuple[Weights, np.ndarray]:

@@ -385,6 +385,20 @@ def whitened_transient(
     return columns, norms, *span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
 
 
+def price_of_transient(model: FrequencyModel, block: SpectralBlock, L: np.ndarray) -> float:
+    """Decrease of a block's log-likelihood if the unknowns of its transient are integrated out: log det(I + N C)/2,
+    with C the Gram matrix of their whitened columns of unit norm, and N real data.
+
+    Each independent column costs log(N)/2 (unit-information prior, Schwarz 1978), a nearly dependent one less.
+    """
+    if not block.transient:
+        return 0.0
+    columns = as_real(np.moveaxis(whitened(L, transient_columns(model, block.omega)[0]), -1, 0))
+    gram = columns @ columns.T
+    norms = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
+    return 0.5 * float(np.linalg.slogdet(np.eye(len(gram)) + block.numbers * gram / (norms * norms[:, None]))[1])
+
+
 def added_terms(
     model: FrequencyModel, blocks: Sequence[SpectralBlock], columns: Sequence[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:

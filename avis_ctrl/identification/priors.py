@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.parameter_sets import default_parameters
@@ -54,6 +55,12 @@ class Priors:
         low = np.where(self.positive & (low <= 0), -np.inf, low)
         z_low, z_high = (np.where(np.isinf(one), one, self.z(one)) for one in (low, high))
         return z_low, z_high
+
+    @cached_property
+    def log_inside(self) -> float:
+        """Logarithm of the probability of the normal distributions inside the bounds, by which the prior is divided."""
+        low, high = self.bounds
+        return float(np.sum(np.log(ndtr(high) - ndtr(low))))
 
     def followed_by(self, other: Priors) -> Priors:
         """Both sets, concatenated."""
