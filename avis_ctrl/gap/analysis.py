@@ -37,15 +37,7 @@ from avis_ctrl.gap.search import (
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import levels, named, time_residuals
 from avis_ctrl.gap.table_model import TableModel
-from avis_ctrl.gap.tolerances import (
-    credible,
-    has_tolerance,
-    moved,
-    of_effect,
-    of_values,
-    tolerances_behind,
-    with_tolerance,
-)
+from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
 from avis_ctrl.gap.validation import Power, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
@@ -121,7 +113,8 @@ def analyse(
     steps, best = _without_weak(fits.steps, fits.best, prepared.fit_data, settings)
     more, best = outliers(best, prepared.fit_data, known, prepared.run)
     fits = replace(fits, steps=(*steps, *more), best=best)
-    fits, names = _names(fits, prepared, known)
+    progress("validation of the effects on held-out records")
+    names = _names(fits, prepared)
     return _gap(prepared, fits, names, known, seed, began)
 
 
@@ -220,25 +213,7 @@ def _excess(base: Fitted, data: Data) -> float:
     return residual.nrmse**2 - residual.noise_nrmse**2
 
 
-def _names(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> tuple[Fits, Names]:
-    """The names, and the fits with which they were found. Without an effect that is refused, values may move beyond
-    their tolerance; these are searched again."""
-    run = prepared.run
-    run.progress("validation of the effects on held-out records")
-    names = _judged(fits, prepared)
-    if not names.refused:
-        return fits, names
-    run.progress("search without the effects that are refused")
-    best = names.updated
-    more = search(best, prepared.fit_data, of_values(effects, best.model), run)
-    if not more:
-        return fits, names
-    kept = [step for step in fits.steps if step.label in best.labels]
-    again = _judged(replace(fits, steps=(*kept, *more), best=more[-1].fitted), prepared)
-    return replace(fits, steps=(*fits.steps, *more)), replace(again, refused={**again.refused, **names.refused})
-
-
-def _judged(fits: Fits, prepared: Prepared) -> Names:
+def _names(fits: Fits, prepared: Prepared) -> Names:
     """Name the effects that pass all checks: an effect must be more probable than its alternatives, have the same size
     in both halves of band and level, and make held-out records more likely."""
     data, held, settings = prepared.fit_data, prepared.held_data, prepared.run.settings

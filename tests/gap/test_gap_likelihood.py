@@ -15,19 +15,20 @@ from scipy.optimize import lsq_linear, minimize
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
-from avis_ctrl.gap.probability import odds_against
+from avis_ctrl.gap.probability import odds_against, probability_of, probability_of_rival
 from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effect, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
-from avis_ctrl.gap.validation import halves
+from avis_ctrl.gap.validation import by_information, halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
-from avis_ctrl.identification.maximum_likelihood import transient_unknowns
+from avis_ctrl.identification.maximum_likelihood import price_of_transient, transient_unknowns, whitened
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import Priors, beside, identified, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.spectra import transient_columns
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.variances import Variances, estimated
 from avis_ctrl.identification.weights import path_contributions, weigh
@@ -438,6 +439,76 @@ def test_clusters_are_octaves_of_bands_and_levels():
     assert [sorted(len(part) for part in parts) for parts in octaves] == [[2, 6, 6], [2, 6, 6], [4, 4, 6]]
     assert [len(part) for part in levels] == [7, 7]
     assert all(sorted(group for part in parts for group in part) == sorted(groups) for parts in (*octaves, levels))
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "cost"),
+    [("mount_relaxation", "isolators z", (0.0, 3.0)), ("attached_oscillator", "payload/axes", (9.0, 24.0))],
+)
+def test_a_state_at_the_ends_costs_what_it_adds(name, place, cost):
+    """Against the determinant of the whole covariance of the data. The relaxations of four mounts decay alike: their
+    states are hardly distinguishable from an impulse on the table. Six states of a sprung mass cost 3.6 nats each at
+    most, log(720)/2 + log(2)/2."""
+    bare_model = replace(TableModel(bare()), corners_differ=True)
+    record, prices = block(bare(), 5), []
+    L = np.linalg.inv(np.linalg.cholesky(record.noise))
+    for model in (bare_model, bare_model.with_effect(active(library()[name], bare_model, place))):
+        columns = whitened(L, transient_columns(model, record.omega)[0]).reshape(
+            -1, len(transient_columns(model, record.omega)[1])
+        )
+        A = np.concatenate([columns.real, columns.imag])
+        A = A / np.linalg.norm(A, axis=0)
+        whole = 0.5 * np.linalg.slogdet(np.eye(len(A)) + len(A) * A @ A.T)[1]
+        prices.append(price_of_transient(model, record, L))
+        assert prices[-1] == pytest.approx(whole, rel=1e-6)
+    assert cost[0] < prices[1] - prices[0] < cost[1]
+
+
+def test_priors_are_normalised_inside_their_bounds():
+    one = Priors(
+        ("a", "b"),
+        np.array([1.0, 2.0]),
+        np.array([0.5, 1.0]),
+        np.zeros(2, bool),
+        np.array([0.0, -np.inf]),
+        np.array([1.5, np.inf]),
+    )
+    inside = stats.norm(1.0, 0.5).cdf(1.5) - stats.norm(1.0, 0.5).cdf(0.0)
+    assert one.log_inside == pytest.approx(np.log(inside))
+
+
+@pytest.mark.parametrize(("information", "low"), [([51.0, 49.0], 1), ([1.0, 1.0, 5.0], 2), ([5.0, 1.0, 1.0], 1)])
+def test_halves_exist_whatever_the_division_of_the_information(information, low):
+    values = np.arange(float(len(information)))
+    (_, below), (_, above) = by_information(values, np.array(information), "low", "high")
+    assert list(below) == list(range(low)) and list(above) == list(range(low, len(information)))
+    assert by_information(np.ones(3), np.ones(3), "low", "high") == []
+
+
+def test_sensor_1_is_not_sensor_10():
+    one = SimpleNamespace(effect=library()["sensor_gain"], place="S1")
+    assert tolerances_behind(one, ("sensor.S1", "sensor.S10", "sensor.S1@x")) == [0]
+    one = SimpleNamespace(effect=library()["sensor_misalignment"], place="S1")
+    assert tolerances_behind(one, ("direction.S1.x", "direction.S1.y", "direction.S10.x")) == [0, 1]
+
+
+def test_probabilities_of_equally_good_effects_are_equal():
+    """Two effects of the library share the probability; one that is not in it has a tenth of their odds."""
+
+    def fitted(label, outside, gain):
+        groups = {(0.2, k): gain / 20 for k in range(20)}
+        model = SimpleNamespace(effect=lambda _: SimpleNamespace(outside=outside))
+        return SimpleNamespace(labels=(label,), model=model, log_likelihoods=groups, log_evidence=gain)
+
+    tried = {"a@x": fitted("a@x", False, 100.0), "b@x": fitted("b@x", False, 100.0), "c@x": fitted("c@x", True, 100.0)}
+    step, settings = Step(fitted("", False, 0.0), tried["a@x"], tried, 3), GapSettings()
+    own, _ = probability_of(step, settings)
+    assert own == pytest.approx(1 / 2.1)
+    assert probability_of_rival(step, "a@x", settings) == own
+    assert probability_of_rival(step, "b@x", settings) == pytest.approx(1 / 2.1)
+    assert probability_of_rival(step, "c@x", settings) == pytest.approx(0.1 / 2.1)
+    other = replace(step, fitted=tried["c@x"], label="c@x")
+    assert probability_of(other, settings)[0] == pytest.approx(0.1 / 2.1)
 
 
 def test_odds_by_how_evenly_two_models_differ():
