@@ -225,17 +225,20 @@ def docstring(text: str) -> str:
     return "\n".join([*lines, *(["```"] if code else [])])
 
 
+def _with_references(text: str) -> str:
+    return REFERENCE.sub(lambda match: reference(match[1], match[2] or ""), text)
+
+
 def on_page_markdown(text: str, page: Any, config: Any, files: Any) -> str:
     """The hook of mkdocs."""
     from mkdocs.structure.files import File
 
     level, source = LEVELS.index(os.environ.get("AVIS_DOCS", "full")), page.file.src_uri
-    text = REFERENCE.sub(lambda match: reference(match[1], match[2] or ""), text)
     if not page.meta.get("run"):
-        return text
+        return _with_references(text)
     with folder_for_page() as folder:
         runner = Runner(source, folder, level)
-        shown = runner.page(text)
+        shown = _with_references(runner.page(text))  # last: their signatures are not examples
     made = dict(runner.files)
     if page.meta.get("notebook"):
         name = f"{Path(source).stem}.ipynb"
