@@ -226,6 +226,7 @@ def docstring(text: str) -> str:
 
 
 def _with_references(text: str) -> str:
+    """The page with the docstrings of the names that it refers to."""
     return REFERENCE.sub(lambda match: reference(match[1], match[2] or ""), text)
 
 

@@ -16,10 +16,10 @@ from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.unnamed import unnamed_faults
-from avis_ctrl.gap.line_response import forget
+from avis_ctrl.gap.line_response import clear_cache
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order
-from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probability_of, probability_of_rival
+from avis_ctrl.gap.probability import Step, name_of, odds_against_fit, probabilities, probability_of
 from avis_ctrl.gap.residual import ModelResidual, every_record, heat_map, places
 from avis_ctrl.gap.result import Considered, Detectable, Gap, NamedEffect, Remainder, Stage, Verdict, Where, missed
 from avis_ctrl.gap.run import Mapper, Progress, Run, between_stages, sequential_map
@@ -145,8 +145,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
 def _searched_from(at_file: Fitted, fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """The better of two searches, the second of which starts from the values of the rig file.
 
-    Values that moved further than their tolerances allow may imitate an effect, and a search that starts from them
-    starts with all values wrong.
+    Values that moved further than their tolerances allow may compensate for a missing effect.
     """
     data = prepared.fit_data
     step = next_effect_from(at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
@@ -313,7 +312,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
     if after.chi2_per_dof <= settings.known_noise:
         progress("noise of floor and sensors")
         residual = time_residuals(prepared.campaign, updated.model, prepared.run.each)
-        forget()
+        clear_cache()
         faults = replace(faults, noise=levels(residual, updated.model, faults.hum, faults.converter))
     found += [replace(one, share=_share_of_signal(one.name, raw, before, power)) for one in named(faults, settings)]
     found.sort(key=lambda one: -(one.share or 0.0))
@@ -448,7 +447,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
     """Effects that were fitted but not named, the most probable first."""
     rows, thin, settings = [], prepared.held_data.blocks, prepared.run.settings
     for number, step in enumerate(fits.steps, 1):
-        top = max(one.log_evidence for one in step.tried.values())
+        top, probability = max(one.log_evidence for one in step.tried.values()), probabilities(step, settings)
         for label, one in sorted(step.tried.items(), key=lambda item: -item[1].log_evidence):
             effect = one.model.effects[-1]
             if effect.effect.outside or label in names.updated.labels:
@@ -465,7 +464,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
                     effect.effect.name,
                     name_of(label)[1],
                     chi2,
-                    min(probability_of_rival(step, label, settings), settings.most_sure),
+                    min(probability[label], settings.most_sure),
                     reason,
                     reported,
                 )

@@ -116,7 +116,7 @@ _last: list[tuple[tuple[object, ...], LineResponse]] = []
 
 
 def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> LineResponse:
-    """The linear part of a model for records of one length; the last result is cached until `forget` is called.
+    """The linear part of a model for records of one length; the last result is cached until `clear_cache` is called.
 
     Raises
     ------
@@ -136,12 +136,12 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
             f"expected the rig's own {1 / model.period_s:g} Hz", field="sample_rate_Hz", value=sample_rate_Hz
         )
     padded = scipy.fft.next_fast_len(max(2 * samples, samples + int(np.ceil(SETTINGS.quiet_s * sample_rate_Hz))), True)
-    forget()  # first, so that memory never holds two
+    clear_cache()  # first, so that memory never holds two
     _last.append((key, LineResponse(model, samples, padded, sample_rate_Hz)))
     return _last[0][1]
 
 
-def forget() -> None:
+def clear_cache() -> None:
     """Free the memory of the cached response, some 3 kB per sample of a record."""
     for _, response in _last:
         response.kept.clear()  # they refer to the response: only garbage collection would free it

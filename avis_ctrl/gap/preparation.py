@@ -16,7 +16,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide, with_noise
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.line_response import forget
+from avis_ctrl.gap.line_response import clear_cache
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
 from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.settings import GapSettings
@@ -48,8 +48,7 @@ class Prepared:
     campaign : without hum and clipping. fitted, held_out : spectra of all lines, with noise. unmasked : the held-out
         spectra including the lines polluted by hum. noise : a sentence on the source of the noise. nominal : the rig as
         in its file. rough : the first fit. faults : of the signals. clipped : the campaign before the repair of clipped
-        samples, None if there are few. run : how the search
-        runs.
+        samples, None if there are few. run : how the search runs.
     """
 
     campaign: Campaign
@@ -136,7 +135,7 @@ def with_noise_from(prepared: Prepared, model: TableModel) -> Prepared:
     """Estimate the noise again, from the residual of a better model."""
     groups = [list(prepared.fitted), list(prepared.held_out), list(prepared.unmasked)]
     residual = time_residuals(prepared.campaign, model, prepared.run.each)
-    forget()
+    clear_cache()
     (fitted, held_out, unmasked), how = _noise(groups, prepared.halves, residual, prepared.rough, prepared.band_Hz)
     return replace(prepared, fitted=tuple(fitted), held_out=tuple(held_out), unmasked=tuple(unmasked), noise=how)
 
@@ -185,7 +184,7 @@ def _ready(
     (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, residual, rough, band)
     parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
     motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)
-    forget()
+    clear_cache()
     return Prepared(
         campaign,
         halves,

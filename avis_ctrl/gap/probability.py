@@ -72,13 +72,15 @@ def prior_odds(fitted: Fitted, label: str, settings: GapSettings) -> float:
     return 1 / settings.outside_odds if fitted.model.effect(label).outside else 1.0
 
 
-def probability_of_rival(step: Step, label: str, settings: GapSettings) -> float:
-    """Probability of one of the fits that were tried in a step (`probability_of`)."""
-    own, mine, one = probability_of(step, settings)[0], step.tried[step.label], step.tried[label]
-    if label == step.label:
-        return own
-    prior = prior_odds(one, label, settings) / prior_odds(mine, step.label, settings)
-    return min(own * odds_against_fit(mine, one) * prior, 1 - own)
+def probabilities(step: Step, settings: GapSettings) -> dict[str, float]:
+    """Probability of each fit that was tried in a step, by label; of the accepted effect that of `probability_of`."""
+    own, mine = probability_of(step, settings)[0], step.tried[step.label]
+    prior = prior_odds(mine, step.label, settings)
+
+    def of(label: str, one: Fitted) -> float:
+        return min(own * odds_against_fit(mine, one) * prior_odds(one, label, settings) / prior, 1 - own)
+
+    return {label: own if label == step.label else of(label, one) for label, one in step.tried.items()}
 
 
 def probability_of(
@@ -92,8 +94,8 @@ def probability_of(
     odds = {("", ""): odds_against(mine, step.before) / prior}
     for label, one in step.tried.items():
         if name_of(label) != own:
-            own_odds = odds_against(mine, one) * prior_odds(one, label, settings) / prior
-            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), own_odds)
+            rival = odds_against(mine, one) * prior_odds(one, label, settings) / prior
+            odds[name_of(label)] = max(odds.get(name_of(label), 0.0), rival)
     probability = 1 / (1 + sum(odds.values()))
     rivals = [
         name

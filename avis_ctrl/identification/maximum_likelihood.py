@@ -382,7 +382,12 @@ def whitened_transient(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """`transient_columns` of a block with their norms, and `span` Q (N, r), X (n_t, r) of the whitened columns."""
     columns, norms = transient_columns(model, block.omega)
-    return columns, norms, *span(as_real(np.moveaxis(whitened(L, columns), -1, 0)).T)
+    return columns, norms, *span(_white_columns(columns, L).T)
+
+
+def _white_columns(columns: np.ndarray, L: np.ndarray) -> np.ndarray:
+    """(n_t, N) whitened real columns from (n, n_y, n_t)."""
+    return as_real(np.moveaxis(whitened(L, columns), -1, 0))
 
 
 def price_of_transient(model: FrequencyModel, block: SpectralBlock, L: np.ndarray) -> float:
@@ -393,7 +398,7 @@ def price_of_transient(model: FrequencyModel, block: SpectralBlock, L: np.ndarra
     """
     if not block.transient:
         return 0.0
-    columns = as_real(np.moveaxis(whitened(L, transient_columns(model, block.omega)[0]), -1, 0))
+    columns = _white_columns(transient_columns(model, block.omega)[0], L)
     gram = columns @ columns.T
     norms = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
     return 0.5 * float(np.linalg.slogdet(np.eye(len(gram)) + block.numbers * gram / (norms * norms[:, None]))[1])
@@ -429,19 +434,10 @@ def added_terms(
 
 
 def whitener(block: SpectralBlock) -> np.ndarray:
-    """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), with a correction if the covariance was estimated.
-
-    The inverse of a Wishart matrix of n_y outputs and dof degrees of freedom is too large by dof/(dof - n_y).
-    """
+    """(n, 1 or m, n_y, n_y) sqrt(2) inv(chol(C)), C the noise covariance with `SpectralBlock.precision_factor`."""
     if block.noise is None:
         raise InputError("expected the covariance of its noise", field=f"block {block.name}")
-    n_y = block.noise.shape[-1]
-    if block.dof <= n_y:
-        raise InputError(
-            f"expected more than {n_y} degrees of freedom in the noise covariance",
-            field=f"block {block.name}",
-            value=block.dof,
-        )
+    correction = block.precision_factor
     try:
         factor = np.linalg.cholesky(block.noise)
     except np.linalg.LinAlgError:
@@ -450,7 +446,6 @@ def whitener(block: SpectralBlock) -> np.ndarray:
             "equal channels, make it singular",
             field=f"block {block.name}",
         ) from None
-    correction = 1.0 if np.isinf(block.dof) else (block.dof - n_y) / block.dof
     return np.sqrt(2 * correction) * np.linalg.inv(factor)
 
 

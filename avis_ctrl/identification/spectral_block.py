@@ -54,6 +54,19 @@ class SpectralBlock:
         """Independent real numbers in Y."""
         return round(2 * self.Y.size / self.shared)
 
+    @property
+    def precision_factor(self) -> float:
+        """Factor on the inverse of the estimated noise covariance: that of a Wishart matrix of n_y outputs and dof
+        degrees of freedom is too large by dof/(dof - n_y). Raises InputError if dof is not larger than n_y."""
+        n_y = self.Y.shape[1]
+        if self.dof <= n_y:
+            raise InputError(
+                f"expected more than {n_y} degrees of freedom in the noise covariance",
+                field=f"block {self.name}",
+                value=self.dof,
+            )
+        return 1.0 if np.isinf(self.dof) else (self.dof - n_y) / self.dof
+
     def with_noise(self, noise: np.ndarray, dof: float = np.inf) -> SpectralBlock:
         """The block with the covariance of its noise, (n, n_y, n_y) or (n, m, n_y, n_y)."""
         n_y = self.Y.shape[1]

@@ -89,10 +89,7 @@ def with_distortion(block: SpectralBlock, level: float, variances: Variances, se
     assert block.noise is not None
     own, of_line = np.unique(bands(block.omega, settings.bands_per_octave), return_inverse=True)
     s = np.array([variances.of_distortion(level, int(band)) for band in own])[of_line]
-    # The inverse of an estimated covariance is too large by dof/(dof - n_y) (Wishart distribution).
-    n_y = s.shape[1]
-    correction = 1.0 if np.isinf(block.dof) else block.dof / (block.dof - n_y)
-    return block.with_noise(correction * block.noise[:, 0] + s[:, :, None] * np.eye(n_y))
+    return block.with_noise(block.noise[:, 0] / block.precision_factor + s[:, :, None] * np.eye(s.shape[1]))
 
 
 def weigh(

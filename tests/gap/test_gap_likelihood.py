@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear, minimize
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
-from avis_ctrl.gap.probability import odds_against, probability_of, probability_of_rival
+from avis_ctrl.gap.probability import odds_against, probabilities, probability_of
 from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effect, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
@@ -502,11 +502,11 @@ def test_probabilities_of_equally_good_effects_are_equal():
 
     tried = {"a@x": fitted("a@x", False, 100.0), "b@x": fitted("b@x", False, 100.0), "c@x": fitted("c@x", True, 100.0)}
     step, settings = Step(fitted("", False, 0.0), tried["a@x"], tried, 3), GapSettings()
-    own, _ = probability_of(step, settings)
+    own, found = probability_of(step, settings)[0], probabilities(step, settings)
     assert own == pytest.approx(1 / 2.1)
-    assert probability_of_rival(step, "a@x", settings) == own
-    assert probability_of_rival(step, "b@x", settings) == pytest.approx(1 / 2.1)
-    assert probability_of_rival(step, "c@x", settings) == pytest.approx(0.1 / 2.1)
+    assert found["a@x"] == own
+    assert found["b@x"] == pytest.approx(1 / 2.1)
+    assert found["c@x"] == pytest.approx(0.1 / 2.1)
     other = replace(step, fitted=tried["c@x"], label="c@x")
     assert probability_of(other, settings)[0] == pytest.approx(0.1 / 2.1)
 

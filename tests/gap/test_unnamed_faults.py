@@ -94,7 +94,7 @@ def test_a_fault_of_one_channel_is_a_factor_on_it_alone(name):
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
 
-def test_what_a_sensors_resonance_starts_with_is_part_of_a_records_ends():
+def test_the_ring_down_of_a_sensors_resonance_is_part_of_the_transient():
     """A lightly damped resonance of a sensor still rings from before the record. Its states are estimated, beside those
     of geophones whose corners have tolerances; otherwise other effects would have to explain them."""
     place, (share, frequency_Hz, damping) = "Sz2", (0.1, 30.0, 0.02)
