@@ -130,6 +130,13 @@ class TableResponse(DrivenTable):
             self.Y,
         )
         dY = operands.derivative(model.names, d, more)
+        if made.n_q > N_Q:
+            # A motor's force constant also acts on the coordinates that effects add.
+            T = model.matrices.T[:3]
+            relative = np.sum(T * d.T[:, :3], axis=1) / np.sum(T**2, axis=0)
+            for row, k in zip(*np.nonzero(relative), strict=True):
+                onto_added = per_force[:, :, N_Q:] @ made.T[N_Q:, k, None]
+                dY[row] += relative[row, k] * onto_added * self.volts[:, k, None]
         if AMPLIFIERS in model.names and self.acting.driven and ops.amplifier_corner_Hz is not None:
             # The effect actuator_lag adds to the time constant.
             driven = replace(model, delay_s=ops.delay_s, amplifier_corner_Hz=ops.amplifier_corner_Hz)

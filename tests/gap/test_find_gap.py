@@ -104,6 +104,14 @@ def test_a_gain_that_drifts_is_named_beside_a_lag():
 
 
 @pytest.mark.slow
+def test_a_gain_is_named_beside_a_flexible_mode():
+    """The force of this drive also acts on the mode."""
+    case, found = found_in(seed=81027, clutter=True, duration_s=60.0)
+    assert {one.name for one in case.effects} == {"actuator_gain", "payload_flexible_mode"}
+    assert {one.name: one.location for one in found.gap.effects} == {one.name: one.location for one in case.effects}
+
+
+@pytest.mark.slow
 def test_a_cable_that_tolerances_imitate_is_named():
     """Values of the rig file up to ten tolerances away leave 0.3 % of the response; starting values found there lead to
     a cable of a few newtons per metre at the wrong place, and to the verdict that nothing is missing."""

@@ -381,6 +381,16 @@ def test_along_its_line_of_action_a_place_may_end_anywhere():
     assert "line of action" in of((2.0, 0.0, 0.1))
 
 
+def test_a_flexible_mode_without_a_resonance_is_refused():
+    def reason(damping):
+        shapes = np.linspace(-0.02, 0.03, 12)
+        values = [25.0, 0.01, *shapes, 60.0, damping, *shapes[::-1]]
+        return forbidden(with_effect("payload_flexible_mode", "payload/two", values))
+
+    assert not reason(0.2)
+    assert reason(0.5) == "a mode so strongly damped that it is no resonance"
+
+
 def test_a_second_mode_and_a_second_frequency_begin_beside_what_is_fitted():
     rng = np.random.default_rng(8)
     first, second = (3e-3 * rng.standard_normal(12) for _ in range(2))

@@ -41,6 +41,8 @@ class LibrarySettings:
         payload [m].
     most_turned : largest rotation about each axis of the axes of a sprung mass relative to x, y, z [rad]: any three
         orthogonal axes are at most 1.1 rad from some permutation of x, y, z.
+    mode_damping : lowest and highest damping ratio of a flexible mode [1]: at the upper one its response is no longer a
+        resonance, and its shapes can compensate for other effects.
     loss_Hz : frequency at which the stiffness of a mount with structural damping equals that of the rig file [Hz]: near
         the suspension resonances.
     leveled : number of mounts with a leveling valve, the first ones; three points determine a plane.
@@ -52,6 +54,7 @@ class LibrarySettings:
     tried_Hz: tuple[float, ...] = (0.3, 3.0, 30.0)
     reach_m: float = 2.0
     most_turned: float = 1.2
+    mode_damping: tuple[float, float] = (1e-4, 0.5)
     loss_Hz: float = 3.0
     leveled: int = 3
     valve_Hz: tuple[float, float] = (0.01, 100.0)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import Effect, EffectParameter, Reported, Table, Values, register
 from avis_ctrl.gap.effects.impedance import paths, peaks
 from avis_ctrl.gap.effects.sensors import receptance, second_order
@@ -39,7 +40,7 @@ class PayloadFlexibleMode(Effect):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
         driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
-        found: list[EffectParameter] = []
+        damping, found = LIBRARY.mode_damping, list[EffectParameter]()
         for k in range(COUNTS[place.partition("/")[2]]):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [
@@ -47,13 +48,17 @@ class PayloadFlexibleMode(Effect):
                     f"frequency{of}_Hz", "Hz", f"{of_mode}, free", 3.0, 400.0, 20.0, np.geomspace(*SETTINGS.mode_Hz)
                 ),
                 EffectParameter.shape(
-                    f"damping{of}", "1", f"damping ratio {of_mode}", 1e-4, 0.5, 0.02, (0.02,), optional=True
+                    f"damping{of}", "1", f"damping ratio {of_mode}", *damping, 0.02, (0.02,), optional=True
                 ),
             ]
             for name, own in zip(names, driven, strict=True):
                 words, short = f"mass-normalised shape {of_mode} at {name}", f"shape{of}_{name.replace('.', '_')}"
                 found.append(EffectParameter(short, "1/sqrt(kg)", words, 0.0, -1.0, 1.0, 0.01, optional=not own))
         return tuple(found)
+
+    def implausible(self, values: Values, std: Values) -> str:
+        broad = any(damping > 0.999 * LIBRARY.mode_damping[1] for _, damping, _ in modes(values))
+        return "a mode so strongly damped that it is no resonance" if broad else ""
 
     def priors(self, model: Table, place: str, values: Values) -> dict[str, tuple[float, float]]:
         """Where no motor acts, a shape has the size that it has elsewhere.
