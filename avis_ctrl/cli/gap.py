@@ -27,7 +27,7 @@ CAMPAIGN: records of the rig: HDF5, .mat, UFF 58 or CSV
 --design-file DESIGN.toml: as --design, with the axes, uncertainty and weights of this file instead of the default
     design for z and phi_x
 --effects FILE.py: Python file with effects of your own, run before the search (docs/own_effect.md)
---despite-gates: continue even if a gate has the result stop
+--despite-gates: continue even if a gate reports a stop
 --seed: seed of all random draws
 """)
 

@@ -40,7 +40,7 @@ MEASUREMENT: HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or fre
 --kalman: also run the extended Kalman filter, for comparison
 --design DESIGN.toml: design file whose rig and uncertainty are replaced by the identified ones; by default a design for
     z and phi_x with the weights of the shipped examples
---despite-gates: continue even if a gate has the result stop
+--despite-gates: continue even if a gate reports a stop
 --seed: seed of all random draws
 """)
 

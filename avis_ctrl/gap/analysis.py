@@ -43,7 +43,7 @@ from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, f
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.summary import percent
+from avis_ctrl.summary import joined, percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     large = of_effect(start.effects[0], tolerances_of(rig), settings)
     priors = re_identified(nominal.rig, settings).followed_by(large)
     base = fit(start, priors, priors.z(start.values), data, first_variances(data, settings), settings)
-    progress("fit with all tolerances")
+    progress("fit with all values of the rig file free")
     tolerances = with_tolerances(nominal, tolerances_of(rig), settings)
     apart = replace(
         base.model,
@@ -225,8 +225,7 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
         if why:
             one = fits.best.model.effect(label)
             refused[label] = (
-                f"it behaves most like {one.effect.described(one.place, one.by_name)}, for which the "
-                "library has no name"
+                f"the residual is most like {one.effect.described(one.place, one.by_name)}, which is not in the library"
                 if one.effect.outside
                 else f"{one.effect.name} fits best, but is not named: {why}"
             )
@@ -250,7 +249,7 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
     if one.effect.outside:
         return "it is not in the library"
     if probability < settings.headline:
-        return f"other explanations are as probable (its own probability is {probability:.2f})"
+        return f"its probability is only {probability:.2f}"
     if reason := forbidden(best, one):
         return reason
     if not _borne_out(best, step, data, held, settings):
@@ -259,7 +258,7 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
     constant = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
     for half in halves(best, constant, settings, absent=one.absent):
         if half.change > settings.law_change:
-            return f"{half.words} alone would give parameters that differ by {100 * half.change:.0f} % or more"
+            return f"for {half.words} alone, its parameters differ by {100 * half.change:.0f} % or more"
     return ""
 
 
@@ -455,7 +454,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
             reason = (
                 names.refused.get(label)
                 or implausible(one)
-                or (f"step {number}: log evidence {top - one.log_evidence:.3g} behind")
+                or (f"step {number}: log evidence {top - one.log_evidence:.3g} lower than the best")
             )
             reported = effect.effect.reported(one.model, effect.place, effect.by_name, one.covariance_of(effect.names))
             chi2 = ModelResidual.of(one.model, thin).chi2_per_dof
@@ -483,21 +482,22 @@ def _opening(
     """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {percent(after.noise_nrmse)}"
-    also = f" Traces of {' and '.join(one.name for one in traces)} were found, too." if traces else ""
+    also = f" Below 1 % of the gap: {joined([one.name for one in traces])}." if traces else ""
+    fitted = "all values of the rig file fitted within their tolerances"
     if verdict == "none":
         return (
-            f"No missing effect was found: with all tolerances fitted, the error on held-out records is "
+            f"No missing effect was found: with {fitted}, the error on held-out records is "
             f"{percent(residual.nrmse)}; {rest}.{also}"
         )
     if verdict == "unexplained":
         return (
-            f"The model misses something that no effect of the library explains: with all tolerances fitted, the "
-            f"error on held-out records is {percent(residual.nrmse)}; {rest}.{also}"
+            f"The model misses something that no effect of the library explains: with {fitted}, the error on "
+            f"held-out records is {percent(residual.nrmse)}; {rest}.{also}"
         )
     lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
     return (
-        f"{missed(reported)} With this and all tolerances fitted, the gap falls from {percent(before)} to "
-        f"{percent(residual.nrmse)}{lines}; {rest}.{also}"
+        f"{missed(reported)} With {'this' if len(reported) == 1 else 'these'} and {fitted}, the gap falls from "
+        f"{percent(before)} to {percent(residual.nrmse)}{lines}; {rest}.{also}"
     )
 
 
@@ -520,7 +520,7 @@ def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
         else ""
     )
     return (
-        f"the residual is {percent(residual.nrmse)} of the held-out records, {residual.over_noise:.3g} times the "
+        f"the residual is {percent(residual.nrmse)} of the held-out signal, {residual.over_noise:.3g} times the "
         f"noise{lies}; its power beyond noise is {percent(residual.share)} of that of the re-identified "
         f"model{level}"
     )

@@ -88,7 +88,7 @@ def divide(campaign: Campaign) -> Halves:
     return Halves(
         replace(campaign, records=(*(first for first, _ in parts), *quiet)),
         replace(campaign, records=tuple(last for _, last in parts)),
-        "the last third of every record, because no two records have the same level",
+        "the last third of every record, because no whole record can be spared",
     )
 
 

@@ -86,21 +86,21 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
     growth = grows(records)
     if growth is None:
         return (
-            f"{where}Repeat the records at half and at twice the level, and "
-            "one record at rest with the floor measured: a residual in proportion to the drive is linear, one that "
+            f"{where}Repeat the records at half and twice the level, and add "
+            "one at rest with the floor measured: a residual in proportion to the drive is linear, one that "
             "grows faster is not, and one that stays the same is noise or comes through the floor."
         )
     power, std = growth
-    rise = f"{where}The residual grows as the level of the drive to the power {power:.2f} +- {std:.2g}"
+    rise = f"{where}The residual beyond noise varies as level to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
         return (
-            f"{rise}: it hardly depends on the drives. Record the table at rest with the floor measured, and "
-            "search for other sources."
+            f"{rise}: it may not depend on the drives. Record the table at rest with the floor measured; "
+            "look for other sources."
         )
     if abs(power - 1) <= max(SETTINGS.within, 2 * std):
         return (
-            f"{rise}: it is linear. Drive one actuator at a time: the drives and sensors for which it appears show "
-            "where it acts."
+            f"{rise}: it may be linear. Drive one actuator at a time: the drives and sensors for which it appears "
+            "show where it acts."
         )
     law = (
         "it grows more slowly than the drive, as with friction or backlash"
@@ -108,8 +108,8 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
         else "it grows faster than the drive, as with stiffening or saturation"
     )
     return (
-        f"{rise}: {law}. Repeat one record at three or more levels with a multisine of odd lines: the size of the "
-        "lines in between, over the level, shows its law."
+        f"{rise}: {law}. Repeat one record at three or more levels with `avis excite --lines odd_detection`: the "
+        "lines that are not excited, against level, show its law."
     )
 
 

@@ -42,10 +42,13 @@ _ELSEWHERE = {
     "base_compliance",
 }
 # Effects that vanish in a linear loop about rest.
-_AT_REST = {"cubic_stiffness": "linear at rest: left out", "actuator_saturation": "no effect below its limit: left out"}
+_AT_REST = {
+    "cubic_stiffness": "no effect at rest: left out",
+    "actuator_saturation": "no effect below its limit: left out",
+}
 _NOTES = {
-    "contact_friction": "motion far below slip: a spring at every motor",
-    "structural_damping": "a ladder of passive branches, causal",
+    "contact_friction": "without slip: a spring at every motor",
+    "structural_damping": "a causal ladder of passive branches",
 }
 
 

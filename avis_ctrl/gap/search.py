@@ -317,7 +317,7 @@ def _compared(
     settings = run.settings
     found = candidates(begun, data, effects, run)
     short = shortlist(found, settings)
-    run.progress(f"  {len(found)} candidates by their first-order gain, of which {len(short)} are fitted")
+    run.progress(f"  {len(found)} candidates ranked by the score test, the best {len(short)} are fitted")
     tried = _tried(begun, short, data, run)
     if not tried:
         return {}, len(found)

@@ -60,6 +60,6 @@ def difference(seen: MeasuredOverlay, i: int, j: int, models: Sequence[Model]) -
     limits = log_limits(np.concatenate([two, *(line for _, line, _ in lines)]), 0.5, 2, (1e-3, 1.0), 0.01)
     curves = (
         *(Curve(f, line, f"measured less {label}", style) for label, line, style in lines),
-        Curve(f, two, "two standard deviations of the measured", TWO_SIGMA),
+        Curve(f, two, "two standard deviations of the measurement", TWO_SIGMA),
     )
     return Panel(hertz(), Axis(f"difference [{unit(seen, j)}]", "log", limits), curves, (), title(seen, i, j))

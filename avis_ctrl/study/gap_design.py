@@ -172,14 +172,14 @@ def compare_designs(
     """
     began, fit, in_files_design = time.monotonic(), uncertainty.blocks if uncertainty else (), design
     design = uncertainty.design if uncertainty else design
-    progress("controller for the baseline: mu synthesis")
+    progress("controller for the re-identified model: mu synthesis")
     plant, asked, rig = plant_of(design, baseline, fit=fit)
     wiring = wiring_of(plant, baseline)
     new_rig = rig
     K = mu_optimal(asked, plant, rig)[0].K
     assert K is not None
     before = figures(asked, baseline, plant, K)
-    progress(f"  mu {before.mu_upper:.3f} on the baseline")
+    progress(f"  mu {before.mu_upper:.3f} on the re-identified model")
     after, new, K_new, when, notes = None, None, None, 0.0, []
     if updated.effects:
         after, when = _worst_moment(design, updated, wiring, K, fit)
@@ -303,36 +303,36 @@ def _outcome(
     """mu of the three loops in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
     if after is None:
         return [
-            f"The controller designed on the baseline has mu {before.mu_upper:.3g} there; no named effect "
+            f"The controller designed on the re-identified model has mu {before.mu_upper:.3g} there; no named effect "
             "changes the model, so nothing else was computed."
         ]
-    first = f"Yesterday's controller has mu {before.mu_upper:.3g} on the baseline and "
+    first = f"The previous controller has mu {before.mu_upper:.3g} on the re-identified model and "
     if after.stable:
         verdict = f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}"
         first += f"{after.mu_upper:.3g} on the updated model: {verdict}."
     else:
         first += "makes the updated model unstable."
     if after.stable and before.stable_in_six and not after.stable_in_six:
-        first += " On all six coordinates it makes the updated model unstable, which the locked ones hide."
+        first += " With all six coordinates the updated model is unstable, which the design model hides."
     if new is None:
         return [first]
     if not new.stable:
         return [first, "The controller designed on the updated model does not stabilise it."]
-    reach = "meets the specification" if new.mu_upper < 1 else "misses the specification too"
+    reach = "meets the specification" if new.mu_upper < 1 else "is not proved to meet the specification"
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
     second = f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} ({bounds})."
     if target and after.mu_upper < new.mu_upper < 1:
-        second += f" Synthesis stops near its target of {target:g}: it does not look for the lowest mu."
-    return [first, second if new.stable_in_six else f"{second} On all six coordinates it is unstable."]
+        second += f" Synthesis stops near its target of {target:g}: it does not search for the lowest mu."
+    return [first, second if new.stable_in_six else f"{second} With all six coordinates the loop is unstable."]
 
 
 def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
     if np.isfinite(before.worst_peak_dB) and not np.isfinite(after.worst_peak_dB):
         return "stability is no longer proved for every table within the design's uncertainty"
     if not np.isfinite(before.worst_peak_dB):
-        return "stability was not proved on the baseline for every table within the design's uncertainty"
+        return "stability was not proved on the re-identified model for every table within the design's uncertainty"
     return (
         f"worst-case transmissibility goes from {before.worst_peak_dB:.1f} to {after.worst_peak_dB:.1f} dB at its "
         f"peak and from {before.worst_band_dB:.1f} to {after.worst_band_dB:.1f} dB in the band"
@@ -341,17 +341,17 @@ def _worst_case(before: LoopFigures, after: LoopFigures) -> str:
 
 def _verdict(before: float, after: float, held: str) -> str:
     if before < 1 <= after:
-        return "robust performance is lost"
+        return "mu is no longer below 1"
     if after < 1 <= before:
-        return "robust performance is reached"
+        return "mu is now below 1"
     if abs(after - before) <= 0.02 * before:
         return {
-            "all": "the effect does not matter to it",
-            "some": "the named effects that this loop contains do not matter to it",
+            "all": "mu hardly changes",
+            "some": "the effects in this loop hardly change mu",
             "none": "mu stays because this loop contains none of the named effects",
         }[held]
-    kept = "robust performance is kept" if after < 1 else "robust performance is missed on both"
-    return f"it is {'worse' if after > before else 'better'}, {kept}"
+    kept = "below 1 with both models" if after < 1 else "below 1 with neither model"
+    return f"mu is {'higher' if after > before else 'lower'}, {kept}"
 
 
 def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[str]:
@@ -360,8 +360,8 @@ def _other_ranges(design: Design, uncertainty: FitUncertainty | None) -> list[st
         return []
     ranges = ", ".join(f"{name} {size:g} %" for name, size in design.uncertainty.parameters_percent.items())
     return [
-        f"design.toml has no place for the blocks of a fit; the parameters' ranges in it are "
-        f"{ranges or 'none'}, so that `avis design` finds another mu."
+        f"design.toml cannot contain the uncertainty of the fit; its parameter ranges are {ranges or 'none'}, so "
+        "`avis design` gives another mu."
     ]
 
 
@@ -371,31 +371,31 @@ def _remarks(
     """Sentences on the accuracy of the figures and on where the effects are described."""
     if not model.effects:
         return []
-    error = f"at most {100 * realised.error:.2g} %" if realised.error > 1e-6 else "rounding only"
+    error = f"at most {100 * realised.error:.2g} %" if realised.error > 1e-6 else "round-off"
     said = [
-        f"In state space the updated model differs from its own response by {error} "
-        f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliases of "
-        f"sampling, up to {100 * realised.aliases:.2g} %, are left out.",
+        f"The state-space form of the updated model deviates from its response by {error} "
+        f"from {realised.omega[0] / 2 / np.pi:.3g} to {realised.omega[-1] / 2 / np.pi:.3g} Hz; aliasing, "
+        f"up to {100 * realised.aliases:.2g} %, is neglected.",
         *realised.notes,
-        "mu and transmissibility are of the design's coordinates, the others locked; stability was looked at on "
-        "all six too.",
+        "mu and transmissibility are for the design's coordinates, the others locked; stability was checked with all "
+        "six.",
     ]
     left = delay_order(design, plant_rig)[1]
     if left > 0.1:
         said.append(
-            f"The delay of {1e3 * plant_rig.loop_delay_s:.3g} ms is beyond the order that a design's delay may "
-            f"have: error {left:.2g} at the bandwidth of the drives, so do not rely on the new controller."
+            f"The delay of {1e3 * plant_rig.loop_delay_s:.3g} ms needs a higher Pade order than is allowed (error "
+            f"{left:.2g} at the bandwidth of the drives): do not rely on the new controller."
         )
     if any(one.effect.name == "stiffness_drift" for one in model.effects):
-        said.append(f"Stiffness is taken at the {'begin' if when < 0 else 'end'} of the campaign, where mu is larger.")
+        said.append(f"Stiffness is taken at the {'start' if when < 0 else 'end'} of the campaign, where mu is larger.")
     by_label = {one.label: one.effect.name for one in model.effects}
     if files.inside:
         places = {label: DESCRIBED_IN.get(by_label[label]) for label in files.inside}
         where = [f"{label} ({place})" if place else label for label, place in places.items()]
-        said.append(f"rig.toml and design.toml hold {', '.join(where)}: `avis design` runs on the updated model.")
+        said.append(f"rig.toml and design.toml contain {', '.join(where)}, so `avis design` includes them.")
     if files.outside:
         said.append(
-            f"No rig or design file holds {', '.join(files.outside)}: only the figures here have it in them, and "
+            f"Rig and design files cannot contain {', '.join(files.outside)}: the figures here include them, "
             "`avis design` on these files does not."
         )
     return said

@@ -109,20 +109,20 @@ class FitUncertainty:
         own = self.to_json()
         sizes = ", ".join(f"{name} {_percent(size)}" for name, size in own["blocks"].items())
         blocks = (
-            f"{len(self.blocks)} real blocks that change the response by at most {sizes}"
+            f"{len(self.blocks)} real blocks (largest change of the response: {sizes})"
             if sizes
             else "too little for a block of its own"
         )
         share = f" ({_percent(own['left_out_over_neglected_dynamics'])} of the drives' neglected dynamics)"
         return (
-            f"Uncertain in every loop: the {self.n_parameters} parameters of the fit at "
-            f"{_percent(self.confidence)}, {blocks}. "
-            "What changes after the measurement is not in it: for that, give a design with ranges.",
-            f"Left out of the loops: combinations of parameters that change the response to the drives by at most "
+            f"All loops include the uncertainty of the {self.n_parameters} fitted parameters at "
+            f"{_percent(self.confidence)}: {blocks}. "
+            "For later changes of the table, give a design with ranges.",
+            f"Not in the loops: combinations of parameters that change the response to the drives by at most "
             f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
-            f"{_percent(own['left_out_floor'])}; products of changes, {_percent(own['products'])} in tables drawn; "
-            f"what sensors, effects and locked coordinates add, at most {_percent(own['not_in_equations'])}. "
-            "Parameters of effects that depend on amplitude are in none of these figures.",
+            f"{_percent(own['left_out_floor'])}; second-order terms, {_percent(own['products'])} in random "
+            f"samples; changes through sensors, effects and locked coordinates, at most "
+            f"{_percent(own['not_in_equations'])}. Effects that depend on amplitude are not counted.",
         )
 
 

@@ -314,10 +314,10 @@ def test_exchanged_columns_and_a_flipped_sign_are_refused():
     data = drive(coulomb)
     with pytest.raises(InputError, match="exchanged"):
         friction_gap({"force": data["position"], "position": data["force"]})
-    with pytest.raises(InputError, match="flipped"):
+    with pytest.raises(InputError, match="wrong sign"):
         friction_gap(data | {"force": -data["force"]})
     u, y = oscillator(lambda y, v: 0.01 * y**3, 1, n=8192)
-    for columns, said in (((y, u), "exchanged"), ((-u, y), "flipped")):
+    for columns, said in (((y, u), "exchanged"), ((-u, y), "wrong sign")):
         with pytest.raises(InputError, match=said):
             find_axis_gap("oscillator", records=[Signals("a", *columns)], rate=RATE, band_Hz=(2.0, 180.0))
 
@@ -420,7 +420,7 @@ def of(force, position):
     ("kind", "data", "said"),
     [
         ("table", {}, "expected one of drive, oscillator, seismometer, levels"),
-        ("oscillator", {}, r"expected for kind oscillator the data records, rate, \[band_Hz\]"),
+        ("oscillator", {}, r"kind oscillator needs the data records, rate, \[band_Hz\]"),
         ("oscillator", of(WAVE.force, np.zeros(3)), "4000 finite"),
         ("oscillator", of(WAVE.force, np.full(4000, np.nan)), "finite"),
         ("oscillator", {"records": [WAVE], "rate": -1.0}, "sample rate"),

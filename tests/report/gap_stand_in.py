@@ -239,7 +239,7 @@ def with_verdict(gap: Gap, verdict: str) -> Gap:
 
 
 def design() -> DesignEffect:
-    """Yesterday's controller, which the effect spoils, and a new one; without the controllers themselves."""
+    """The previous controller, which the effect spoils, and a new one; without the controllers themselves."""
     nothing: Any = None
     return DesignEffect(
         LoopFigures(True, True, 0.95, 0.94, 3.1, -12.0, 5.2, -9.1, 60.0),
@@ -252,7 +252,7 @@ def design() -> DesignEffect:
         ("com_offset@payload",),
         {},
         (
-            "Yesterday's controller has mu 0.95 on the baseline and 1.32 on the updated model.",
+            "The previous controller has mu 0.95 on the re-identified model and 1.32 on the updated model.",
             "A controller designed on the updated model has mu 0.97 there.",
         ),
         30.0,

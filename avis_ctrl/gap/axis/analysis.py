@@ -76,7 +76,7 @@ def analyse(problem: Problem, progress: Progress = lambda text: None, settings: 
             best = rest or base
     removed = power(base) - power(best)
     if not names or (free is not None and removed < settings.right_shape * (power(base) - power(free))):
-        refused |= {one.effect.name: "a function of another shape takes far more" for one in names}
+        refused |= {one.effect.name: "a function of another shape removes far more" for one in names}
         names, best, free = [], base, unnamed(base, explored)
         shares = Contributions.of(best, free, names, explored)
     return _gap(explored, best, free, shares, names, refused)
@@ -114,8 +114,7 @@ def _name(best: Fitted, one: Effect, explored: Explored) -> Name:
     found = halves(best, one.sizes, settings, parts(best, one.sizes), dict.fromkeys(one.sizes, 0.0))
     refused = _refusal(best, rest, found, explored)
     if probability < settings.headline:
-        odds = [(explored.odds_against(best, step.before), "nothing"), *((r.odds, r.effect.name) for r in others)]
-        refused = f"{max(odds, key=lambda one: one[0])[1]} in its place is as probable"
+        refused = f"its probability is only {probability:.2f}"
     return Name(one, probability, near, refused, _widening(found, settings))
 
 
@@ -129,10 +128,10 @@ def _refusal(best: Fitted, rest: Fitted | None, found: Sequence[Half], explored:
     if edge := at_an_edge(best):
         return edge
     if rest is not None and explored.held_out(best) <= explored.held_out(rest):
-        return "held-out data do not bear it out"
+        return "held-out data do not confirm it"
     for half in found:
         if half.change > explored.settings.law_change:
-            return f"{half.words} calls for another size, by {100 * half.change:.0f} %"
+            return f"for {half.words} its size differs by {100 * half.change:.0f} %"
     return ""
 
 
@@ -383,12 +382,12 @@ def _sentences(
         sentences = [f"No missing effect was found: the error on held-out data is {last}."]
     elif verdict == "unexplained":
         sentences = [
-            f"The error of the base model on held-out data is {first}, more than noise, and no effect of the "
-            "library explains it."
+            f"The error of the base model on held-out data is {first}, and no effect of the library explains it."
         ]
     else:
         sentences = [
-            f"{missed(reported)} With this the gap on held-out data falls from {first} to {last}."
+            f"{missed(reported)} With {'this' if len(reported) == 1 else 'these'} the gap on held-out data falls "
+            f"from {first} to {last}."
             f"{' A part is not explained.' * (verdict != 'explained')}"
         ]
     if traces:

@@ -60,9 +60,7 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
     if set(data) - set(known) or any(name not in data for name, one in known.items() if one.default is one.empty):
         expected = ", ".join(name if one.default is one.empty else f"[{name}]" for name, one in known.items())
         raise InputError(
-            f"expected for kind {kind} the data {expected} (in brackets what may be left out)",
-            field="data",
-            value=sorted(data),
+            f"kind {kind} needs the data {expected} (those in brackets are optional)", field="data", value=sorted(data)
         )
     begun, report = time.perf_counter(), progress or (lambda text: None)
     report("reading and windows")

@@ -177,15 +177,14 @@ def require_oriented(
     turned, swapped = (left if sensible else np.inf for left, sensible in others)
     if swapped < min(turned, settings.no_model, settings.much_better * residual):
         raise InputError(
-            f"the model leaves {100 * residual:.3g} % of these columns and {100 * swapped:.2g} % with "
-            "input and output exchanged: the columns look exchanged",
+            f"the residual is {100 * residual:.3g} % with these columns and {100 * swapped:.2g} % with input and "
+            "output exchanged: the columns look exchanged",
             field=field,
         )
     if turned < settings.no_model:
         raise InputError(
-            "expected a positive mass: with the input's sign turned the model fits "
-            f"({100 * turned:.2g} % are left), so that the sign of one column looks flipped; give it a "
-            "scale of -1",
+            f"expected a positive mass: with the input reversed the model fits (residual {100 * turned:.2g} %), so "
+            "one column has the wrong sign; give it a scale of -1",
             field=field,
         )
 

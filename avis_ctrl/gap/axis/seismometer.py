@@ -152,8 +152,8 @@ def seismometer(
     )
     if np.any(h):
         notes.append(
-            f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: the "
-            "mass itself is nonlinear, which no effect of a channel holds."
+            f"Harmonics of the motion reach {100 * h.max():.2g} % of it at {f[int(np.argmax(h))]:.3g} Hz: this may "
+            "be a nonlinear mass or drive, for which the library has no effect."
         )
     outputs = " and ".join(names)
     power = float(np.sum(np.abs(data["held out"].blocks[0].Y) ** 2))
@@ -181,7 +181,9 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
 
     def heavy(p: np.ndarray) -> str:
         damping = mode(p)["damping"][0]
-        return f"a mount with a damping of {damping:.2g} is none" if damping > SETTINGS.mode_damping else ""
+        return (
+            f"a resonance with a damping ratio of {damping:.2g} is no mode" if damping > SETTINGS.mode_damping else ""
+        )
 
     for place in ("drive", *reversed(channels)) if len(channels) > 1 else channels:
         what = f"of the {place}"

@@ -35,7 +35,7 @@ class AttachedOscillator(AtPoint):
 
     name = "attached_oscillator"
     title = "a sprung mass on the payload"
-    looks_like = "a pair of peak and dip at its own frequency, in every channel that moves its place"
+    looks_like = "a dip and a nearby peak around its own frequency, in every channel that moves it"
     at = ("payload/oblique", "payload/axes", "payload/turned")
     holds_states = True
     resonant = True
@@ -47,7 +47,7 @@ class AttachedOscillator(AtPoint):
         own = EffectParameter("mass_kg", "kg", "sprung mass", 0.0, 0.0, mass, 0.01 * mass)
         variant = place.partition("/")[2]
         if variant == "oblique":
-            most, words = float(np.sqrt(mass)), "root of the mass times its direction's {}"
+            most, words = float(np.sqrt(mass)), "sqrt(mass) times {} of its direction"
             root = EffectParameter("along_{}", "sqrt(kg)", words, 0.0, -most, most, 0.1 * most).of_each("xyz")
             # The position along the line of action has no effect, so it may end at a bound.
             return (*root, frequency, damping, *(replace(one, optional=True) for one in self.position()))

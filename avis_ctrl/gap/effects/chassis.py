@@ -38,7 +38,7 @@ class BaseCompliance(OfMounts):
 
     name = "base_compliance"
     title = "the chassis stands on something soft and recoils"
-    looks_like = "one more resonance in every channel, and less floor motion above it"
+    looks_like = "further resonances in every channel, and less floor motion above them"
     at = ("chassis/translation", "chassis/rocking")
     holds_states = True
     resonant = True

@@ -38,12 +38,12 @@ class ActuatorLag(Effect):
     """
 
     name = "actuator_lag"
-    title = "the current amplifiers lag, first order"
+    title = "a first-order lag of the current amplifiers"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
     at = ("actuators", "actuators/each")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        own = uneven(model.actuators[:-1], "that of drive {} over the mean, less one") if "/" in place else ()
+        own = uneven(model.actuators[:-1], "relative deviation of drive {} from the mean") if "/" in place else ()
         known = (model.nominal or model.base).amplifier_time_constant_s
         words = "time constant of the amplifiers" + (f" beyond the expected {1e3 * known:.3g} ms" if known else "")
         return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
@@ -106,7 +106,11 @@ class ActuatorSaturation(Effect):
         peak, words = min(max(peaks), known) or known, "voltage at which the drives clip"
         grid = [peak * share for share in (0.9, 0.7, 0.5, 0.35, 0.2)]
         limit = EffectParameter.shape("limit_V", "V", words, peak / 50, peak, peak, grid, none=known)
-        own = uneven(model.actuators[:-1], "limit of drive {} over the mean, less one") if "/" in place else ()
+        own = (
+            uneven(model.actuators[:-1], "relative deviation of the limit of drive {} from the mean")
+            if "/" in place
+            else ()
+        )
         return (limit, *own)
 
     def volts(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:

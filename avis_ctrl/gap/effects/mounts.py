@@ -72,7 +72,7 @@ class StructuralDamping(OfMounts):
 
     name = "structural_damping"
     title = "the mounts lose energy nearly independently of frequency, not in proportion to velocity"
-    looks_like = "damping at low resonances larger, at high ones smaller than one dashpot gives"
+    looks_like = "more damping at low resonances and less at high ones than with dashpots"
     at = ("isolators/causal", "isolators/complex")
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
@@ -97,7 +97,7 @@ class MountSurge(OfMounts):
 
     name = "mount_surge"
     title = "an internal resonance of the mounts (mass of spring, diaphragm or piston)"
-    looks_like = "a resonance far above the suspension's along z, in every vertical channel alike"
+    looks_like = "a resonance far above those of the suspension, equal in all vertical channels"
     holds_states = True
     resonant = True
 
@@ -108,7 +108,7 @@ class MountSurge(OfMounts):
             shape("frequency_Hz", "Hz", "of the mass inside the mounts", 4.0, 400.0, 20.0, grid, none=np.inf),
             shape("payload_share", "1", share, 0.05, 0.95, 0.2, (0.5,), optional=True, none=0.5),
             shape("damping_ratio", "1", "of that resonance", 0.0, 1.0, 0.05, (0.015, 0.05, 0.15), optional=True),
-            *uneven(range(1, count), "frequency of mount {} over the mean, less one", 0.2),
+            *uneven(range(1, count), "relative deviation of the frequency of mount {} from the mean", 0.2),
         )
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
@@ -172,7 +172,7 @@ class LevelingLoop(OfMounts):
     """
 
     name = "leveling_loop"
-    title = "the leveling integrates the position of isolators 1-3"
+    title = "leveling valves integrate the height at isolators 1-3"
     looks_like = "phase and gain change at the lowest frequencies, vertical and tilting channels only"
     at = ("isolators 1-3 z/plain", "isolators 1-3 z/lag", "isolators 1-3 z/each")
     holds_states = True
@@ -184,7 +184,7 @@ class LevelingLoop(OfMounts):
         if place.endswith("plain"):
             return (rate,)
         if place.endswith("each"):
-            return (rate, *uneven(range(1, LIBRARY.leveled), "rate of valve {} over the mean, less one"))
+            return (rate, *uneven(range(1, LIBRARY.leveled), "relative deviation of valve {} from the mean rate"))
         # A valve may be faster than the data can show; its corner then ends at the upper bound.
         low, high, grid = *LIBRARY.valve_Hz, (0.1, 0.3, 1.0, 3.0)
         lag = "first-order lag of the valves"
@@ -240,7 +240,7 @@ class CubicStiffness(OfMounts):
         return (
             stiffness(model, 3, "cubic"),
             *others,
-            *uneven(range(1, int(np.sum(vertical(model.rig)))), "that of mount {} over the mean, less one"),
+            *uneven(range(1, int(np.sum(vertical(model.rig)))), "relative deviation of mount {} from the mean"),
         )
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:
@@ -313,7 +313,7 @@ class ContactFriction(Effect):
         return (
             EffectParameter("stiffness_N_per_m", "N/m", "of a contact before it slips", 0.0, 0.0, 20 * k, 0.05 * k),
             EffectParameter.shape("slip_m", "m", words, 1e-3 * rms, 1e3 * rms, rms, slips),
-            *uneven(model.actuators[:-1], "stiffness of the contact of {} over the mean, less one"),
+            *uneven(model.actuators[:-1], "relative deviation of the contact stiffness of {} from the mean"),
         )
 
     def force(self, record: RecordMotion, place: str, values: Values) -> np.ndarray | None:

@@ -17,7 +17,7 @@ class ComOffset(Effect):
 
     name = "com_offset"
     title = "the centre of mass is not where the model has it"
-    looks_like = "coupling between translations and rotations, at every frequency above the resonances too"
+    looks_like = "coupling between translations and rotations, also at all frequencies above the resonances"
 
     def places(self, model: Table) -> tuple[str, ...]:
         return ("payload",) if "com_x" in model.rig.parameters() else ()

@@ -289,7 +289,7 @@ def _force_law(name: str, term: str, unit: str, power: int, law: Callable[[np.nd
     """Force of one motor, or of all, that is not proportional to the voltage."""
     return AddedSignal(
         name,
-        f"the force of {{place}} not in proportion to voltage, with a term in {term}",
+        f"a nonlinear force of {{place}}, with a term in {term} of the voltage",
         _motors,
         lambda model: _strength(unit, term, 0.01 / largest_volts(model) ** power),
         lambda record: law(record.volts),
@@ -316,7 +316,7 @@ def _reading_law(name: str, term: str, parameter: EffectParameter, power: int) -
     """One sensor whose reading contains a power of itself."""
     return AddedSignal(
         name,
-        f"{{place}} not linear, with a term in the {term} of its reading",
+        f"a nonlinear {{place}}, with a term in the {term} of its reading",
         lambda model: model.sensors.names if _read(model) else (),
         lambda model: parameter,
         lambda record: (record.y - record.y.mean(0)) ** power,

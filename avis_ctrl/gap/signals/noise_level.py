@@ -125,10 +125,10 @@ class FloorLevel:
         m, seen = self.rms["mean"], self.seen["mean"]
         each = ", ".join(f"{axis} {1e6 * self.rms[axis].value:.3g}" for axis in "xyz")
         return (
-            f"The floor, not measured, moves with {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
+            f"The unmeasured floor moves by {1e6 * m.value:.3g} +- {1e6 * m.std:.2g} um/s r.m.s. in 0.5-60 Hz"
             f" ({each}), {m.value / self.ambient:.3g} times the rig file's ambient {1e6 * self.ambient:.3g} um/s;"
-            f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are seen up to "
-            f"{min(self.seen_to_Hz.values()):.3g} Hz, the rest is a power law carried on."
+            f" {1e6 * seen.value:.3g} +- {1e6 * seen.std:.2g} um/s of it are measured, up to "
+            f"{min(self.seen_to_Hz.values()):.3g} Hz; the rest is extrapolated (power law)."
         )
 
 

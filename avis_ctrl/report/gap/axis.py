@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
@@ -68,9 +70,10 @@ def _model(gap: AxisGap) -> Section:
 
 
 def _remaining(gap: AxisGap) -> Section:
+    beyond = " beyond noise" if np.isfinite(gap.stages[-1].chi2_per_dof) else ""  # nan if the noise is unknown
     residual = Paragraph(
         f"The residual on held-out data is {words.percent(gap.stages[-1].nrmse)} of the signal, r.m.s.; "
-        f"its power beyond noise is {words.percent(gap.left.share)} of that of the base model."
+        f"its power{beyond} is {words.percent(gap.left.share)} of that of the base model."
     )
     where = listed(
         "Where most of the residual lies, as a fraction of its power.",

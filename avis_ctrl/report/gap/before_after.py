@@ -50,7 +50,7 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
     """Residual power over noise power by frequency: mean of all channels, and worst channel."""
     edges, panels = heat.bands_Hz, []
     sides = [("re-identified", heat.before, BEFORE)] + ([("updated", heat.after, AFTER)] if named else [])
-    for title, reduce in (("Mean of all channels", np.ma.mean), ("Worst channel of each band", np.ma.max)):
+    for title, reduce in (("Mean", np.ma.mean), ("Worst output and record", np.ma.max)):
         curves = []
         for label, values, style in sides:
             reduced = np.ma.filled(reduce(np.ma.masked_invalid(values), axis=1), np.nan)
@@ -60,8 +60,8 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
     return Figure(
         "gap_spectrum",
         "The gap on held-out data: power of the residual relative to that of the "
-        "measured noise, by frequency band. For a complete model the mean is 1, and the worst of "
-        f"{heat.before.shape[1]} channels is a little above.",
+        "measured noise, by frequency band. For a complete model the mean is 1, the worst of "
+        f"{heat.before.shape[1]} (outputs of each record) a little more.",
         panels,
         2,
         0.95,
@@ -100,10 +100,10 @@ def _stages(gap: Gap) -> Table:
     if np.isfinite(noise):
         rows.append(("noise alone", words.percent(noise), "1", "1"))
     return table(
-        "Each model is fitted to the same records; the figures are those of records or periods that no fit "
-        f"has seen: {gap.held_out}. Error: r.m.s. of the residual "
+        "All models but the nominal one are fitted to the same records; the figures are those of held-out data: "
+        f"{gap.held_out}. Error: r.m.s. of the residual "
         "relative to that of the measured outputs.",
-        ("stage", "n.r.m.s. error", "over noise", "chi-square / dof"),
+        ("stage", "n.r.m.s. error", "error / noise", "chi-square / dof"),
         rows,
     )
 

@@ -23,7 +23,7 @@ def candidates(found: GapFinding) -> Section:
         "Rejected candidates",
         "considered",
         _table(caption, ranked[: SETTINGS.candidates]) if ranked else Paragraph(_none(found)),
-        Fold(f"{len(others)} more candidates", shown(_table("The others.", others))),
+        Fold(f"{len(others)} more candidates", shown(_table("More candidates.", others))),
     )
 
 
@@ -35,7 +35,7 @@ def _table(caption: str, some: list[Considered]) -> Table:
             "candidate": wording.candidate,
             "chi-square / dof": lambda one: words.number(one.chi2_per_dof, 4),
             "probability": lambda one: wording.probability(one.probability),
-            "best size": lambda one: wording.quantities(one.parameters, SETTINGS.candidate_parameters) or "not stated",
+            "fitted": lambda one: wording.quantities(one.parameters, SETTINGS.candidate_parameters) or "not stated",
             "why it was not named": lambda one: one.reason,
         },
         "lrrll",

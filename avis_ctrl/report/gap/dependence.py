@@ -52,11 +52,11 @@ def by_record(gap: Gap) -> Figure:
     )
     return Figure(
         "gap_records",
-        "Residual of each record, relative to the noise. Filled: held-out records; open: "
-        "fitted. A missing linear effect gives an error in proportion to the level. An error that is the "
-        "same at every level is noise; an error that grows in any other way depends on amplitude. A slope "
-        "over time is drift. The frequency lines are a random selection, dense near resonances, the same for "
-        "all records: these values differ from those of all lines in the table of stages.",
+        "Residual of each record, relative to the noise. Filled: held-out records; open: fitted. A missing linear "
+        "effect gives an error in proportion to the level. An error that is the same at every level is noise or "
+        "unmeasured floor motion; one that grows in any other way depends on amplitude. A slope over time at one "
+        "level is drift. The frequency lines are a random selection, dense near resonances, the same for all "
+        "records: these values differ from those of all lines in the table of stages.",
         panels,
         2,
         0.85,
@@ -109,9 +109,9 @@ def _explained(one: PowerShares) -> str:
     )
     narrow = float(np.min(np.diff(one.bands_Hz)))
     return (
-        f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear means the "
-        "response of the model, with up to two poles moved, plus any response to the measured inputs that is "
-        f"smooth over a band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
+        f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear: the "
+        "response of the model with smooth corrections and, if they fit much better, up to two shifted poles in each "
+        f"band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
         "is partly counted as not linear."
     )
 

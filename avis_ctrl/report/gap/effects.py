@@ -45,7 +45,7 @@ def _sizes(gap: Gap) -> Table:
             rows.append((one.name, one.location, name, value, spread, words.unit(p.unit)))
     return table(
         "Parameters of the named effects. Those of mechanical and drive effects are fitted together with all "
-        "parameters of the rig and all tolerances; their standard deviation includes the noise and what no effect "
+        "values of the rig file; their standard deviation includes the noise and what no effect "
         "explains. Those of hum, converters and floor motion are estimated from the records directly.",
         ("effect", "place", "parameter", "value", "± 1 σ", "unit"),
         rows,
@@ -89,7 +89,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         )
     return table(
         "A model without the effect is fitted with biased parameters; the change shows by how much. "
-        "A large change is no error: it may lie along a direction that the data hardly determine.",
+        "A large change need not be wrong: the data may hardly determine that combination.",
         ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"),
         rows,
         "lrrrrl",

@@ -29,7 +29,7 @@ def opening(found: GapFinding) -> Section:
     first, *more = map(words.sentence, gap.sentences)
     limits = "The section on the residual lists the detection limits of the effects."
     warned = joined(warnings(found.findings))
-    gates = f"Gates that warned of the records: {warned}; see the section on gates."
+    gates = f"Checks of the records (gates) with warnings: {warned}; see the section on gates."
     return section(
         "Summary",
         "result",
@@ -75,7 +75,7 @@ def _stage(name: str) -> str:
     return {
         "nominal": "with the values of the rig file",
         "re-identified": "after re-identification",
-        "tolerances": "with all tolerances",
+        "tolerances": "with all rig values fitted",
     }.get(name, f"with {wording.titled(name)}")
 
 
@@ -83,7 +83,7 @@ def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
     return listed(
         "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
-        "held-out data if only this effect is removed, divided by the residual power beyond noise of the "
+        "held-out data without this effect, divided by the residual power beyond noise of the "
         f"model without effects. Effects below 1 % are called traces.{remark}",
         [*gap.effects, *gap.traces],
         {

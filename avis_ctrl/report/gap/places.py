@@ -73,14 +73,14 @@ def _short(name: str) -> str:
 def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
     return listed(
-        f"{caption}Fraction: of the total residual power beyond noise. Over noise: residual power divided by "
-        "noise power. p-value: probability of such a residual by noise alone, corrected for the number of "
-        "places tested (family-wise).",
+        f"{caption}Fraction: of the total residual power beyond noise. Power / noise: residual power in this band "
+        "divided by noise power. p-value: probability of such a residual by noise alone, corrected for the number "
+        "of places tested (family-wise).",
         places,
         {
             "place": wording.place,
             "fraction": lambda one: words.percent(one.share),
-            "over noise": lambda one: words.number(one.excess),
+            "power / noise": lambda one: words.number(one.excess),
             "p-value": lambda one: "< 1e−6" if one.p_value < 1e-6 else words.number(one.p_value, 2),
         },
     )

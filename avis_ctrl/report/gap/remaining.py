@@ -39,8 +39,8 @@ def detectable(gap: Gap) -> Table:
         size = " to ".join(_seen(one) for one in ends)
         rows.append((wording.titled(name), where, spoken(parameter, unit), size))
     return table(
-        "Detection limits: the size at which an effect would differ from zero by five standard deviations of "
-        'the fit, at the best and at the worst of its places. Smaller effects may be present. "Not '
+        "Detection limits: five standard deviations of each parameter, as a change from its value without the effect, "
+        'at the best and at the worst place. Smaller effects may be present. "Not '
         'detectable": the re-identified parameters of the rig absorb the effect. Effects with a frequency or '
         "a shape of their own are not in this table.",
         ("effect", "place", "parameter", "detection limit"),
