@@ -1,8 +1,11 @@
 """Peaks over frequency: printed examples, spikes that no grid meets, exact norms, and the guarantee itself."""
 
+from fractions import Fraction
+
 import cvxpy as cp
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 import avis_ctrl as ac
 from avis_ctrl.errors import ComputationError, InputError
@@ -638,3 +641,43 @@ def test_many_equal_or_slow_poles_are_not_at_the_limit_of_stability():
     sampled = StateSpace([[1 - 1e-6, 1.0], [0.0, 1 - 1e-6]], [[0.0], [1.0]], [[1e-13, 0.0]], [[0.0]], dt=1e-3)
     for loop in (chain, slow, sampled):
         assert mu_peak(loop, [ComplexScalar(1)]).guaranteed
+
+
+def exact_gain(N, omega):
+    """|N(j omega)| of a system with one input and one output, in rational arithmetic on its floating-point entries."""
+    n, w = N.nstates, Fraction(omega)
+    # Real and imaginary part of (j w I - A) x = B.
+    A = [[Fraction(float(a)) for a in row] for row in N.A]
+    rows = [
+        [-A[i][j] for j in range(n)] + [-w * (i == j) for j in range(n)] + [Fraction(float(N.B[i, 0]))]
+        for i in range(n)
+    ]
+    rows += [[w * (i == j) for j in range(n)] + [-A[i][j] for j in range(n)] + [Fraction(0)] for i in range(n)]
+    for k in range(2 * n):
+        pivot = next(i for i in range(k, 2 * n) if rows[i][k])
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [a / rows[k][k] for a in rows[k]]
+        for i in range(2 * n):
+            if i != k and rows[i][k]:
+                rows[i] = [a - rows[i][k] * b for a, b in zip(rows[i], rows[k], strict=True)]
+    x = [row[-1] for row in rows]
+    C = [Fraction(float(c)) for c in N.C[0]]
+    real, imag = (sum(c * v for c, v in zip(C, part, strict=True)) for part in (x[:n], x[n:]))
+    return float(real**2 + imag**2) ** 0.5
+
+
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_a_narrow_peak_just_above_the_level_is_not_missed(seed):
+    """Three modes of 1, 1e3 and 1e5 rad/s, the first with a damping ratio of 1e-4, in random coordinates: its two
+    crossings of the level are nearly a double eigenvalue. The gain at its peak is computed exactly."""
+    frequency, damping = np.array([1.0, 1e3, 1e5]), np.array([1e-4, 0.1, 0.1])
+    draw = np.random.default_rng(seed)
+    A = la.block_diag(*([[0, w], [-w, -2 * z * w]] for w, z in zip(frequency, damping, strict=True)))
+    B, C = draw.standard_normal((6, 1)), draw.standard_normal((1, 6)) * np.repeat(8 * frequency * damping, 2)
+    S = draw.standard_normal((6, 6))
+    N = StateSpace(S @ A @ la.inv(S), S @ B, C @ la.inv(S), [[0.0]])
+    peak = mu_peak(N, [ComplexFull(1, 1)])
+    pole = min(N.poles(), key=lambda p: abs(p - 1j))
+    near = pole.imag + abs(pole.real) * np.linspace(-1, 1, 41)
+    highest = near[int(np.argmax(np.abs(N.frequency_response(near)[:, 0, 0])))]
+    assert not peak.guaranteed or exact_gain(N, highest) <= peak.upper * (1 + 1e-6)
