@@ -74,7 +74,12 @@ def test_an_identified_rig_leaves_what_noise_leaves(checked):
         assert np.allclose(one.nrms, one.nrms_floor, rtol=0.3)
         assert 0.97 * one.nrms_all_interval[0] < one.nrms_all < 1.03 * one.nrms_all_interval[1]
         assert one.whiteness is not None and one.whiteness.white
-    assert "expected" in checked.verdict and checked.verdict.startswith("the identified model agrees with the held-out")
+        assert one.nrms_local == pytest.approx(one.nrms_all, rel=0.3) and not one.repeats
+    assert (
+        checked.explains
+        and "expected" in checked.verdict
+        and checked.verdict.startswith("the identified model agrees with the held-out")
+    )
     as_json(checked.as_dict())
 
 

@@ -41,10 +41,19 @@ def test_verdict_has_the_numbers_of_the_validation(found):
     information = found.campaign_fit.information
     assert f"{information.rank} combinations of the {len(information.names)} parameters" in first.text
     assert first.good == (
-        all(h.consistent for h in found.validation.held_out)
+        all(h.consistent and not h.repeats for h in found.validation.held_out)
         and not any(f.severity == "stop" for f in found.findings)
         and found.campaign_fit.fit.converged
     )
+
+
+def test_an_error_that_repeats_in_all_records_is_no_noise(found):
+    """Most dampings are fixed at wrong values: the residuals of all records contain the same error, four times the
+    noise of a local model, and agree with one another."""
+    (one,) = found.validation.held_out
+    assert one.consistent and one.repeats and one.nrms_all > 4 * one.nrms_local
+    assert not found.validation.explains and not found.validation.passed
+    assert "does not explain the records" in found.validation.verdict and "avis gap" in found.validation.verdict
 
 
 def test_the_summary_has_the_modes(found):

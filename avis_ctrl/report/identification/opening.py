@@ -54,7 +54,7 @@ def _sentence(found: Identification) -> Paragraph:
     information = found.information
     alone = int(np.count_nonzero(information.known))
     stops = any(f.severity == "stop" for f in found.findings)
-    consistent = all(one.consistent for one in found.validation.held_out)
+    consistent = all(one.consistent and not one.repeats for one in found.validation.held_out)
     count = len(information.names)
     said = [
         words.sentence(found.validation.verdict),

@@ -46,7 +46,7 @@ def _records(found: Identification) -> Table:
     return listed(
         "Chi-square per degree of freedom of the held-out data, with its 95 % interval for a residual that is "
         f'due only to noise and parameter uncertainty. Noise: {noise}. "Local noise" is the same chi-square '
-        "with the noise covariance of a local polynomial model.",
+        "with the noise covariance of a local polynomial model, which contains no error of the rig's model.",
         found.validation.held_out,
         {
             "record": lambda one: one.name,
