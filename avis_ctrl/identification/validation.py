@@ -34,8 +34,8 @@ from avis_ctrl.summary import percent
 @dataclass(frozen=True)
 class ValidationSettings:
     """level : probability of the intervals of chi-square [1]: the usual one.
-    repeats : ratio of the residual to the noise of a local polynomial model, r.m.s. [1], from which the residual is an
-        error of the model that repeats in the records. Of a correct model it is 0.9 to 1.1.
+    repeats : r.m.s. of the residual, whitened by the noise of a local polynomial model [1], from which it is an error
+        of the model that repeats in the records. Of a correct model it is 0.9 to 1.1.
     """
 
     level: float = 0.95
@@ -54,8 +54,8 @@ class HeldOut:
     ----------
     name : of the record. lines : in the band. noise : which noise the error is compared with, in words.
     chi2_per_dof, chi2_interval : with its 95 % interval if only noise and the uncertainty of the parameters remain.
-        chi2_start : of the start model. chi2_local, nrms_local : with the noise of the local polynomial model of the
-        fitted records, and n.r.m.s. error expected from that noise; NaN without one.
+        chi2_start : of the start model. chi2_local : with the noise of the local polynomial model of the fitted
+        records, NaN without one.
     output_chi2_per_dof, output_chi2_interval : (n_y,) and (n_y, 2), each output separately.
     nrms, nrms_start : (n_y,) r.m.s. error in the band over r.m.s. output in the band, transient of the ends removed.
     nrms_floor : (n_y,) expected from noise alone.
@@ -75,7 +75,6 @@ class HeldOut:
     chi2_interval: tuple[float, float]
     chi2_start: float
     chi2_local: float
-    nrms_local: float
     output_chi2_per_dof: np.ndarray
     output_chi2_interval: np.ndarray
     nrms: np.ndarray
@@ -101,7 +100,7 @@ class HeldOut:
     def repeats(self) -> bool:
         """Whether the residual is an error of the model that repeats in all records: far above the noise of a local
         polynomial model."""
-        return self.chi2_local > SETTINGS.repeats**2 and self.nrms_all > SETTINGS.repeats * self.nrms_local
+        return self.chi2_local > SETTINGS.repeats**2
 
     @property
     def uninformative(self) -> bool:
@@ -280,7 +279,6 @@ def _figures(
     of_output = [interval(expected, dof, noise_dof / len(power), SETTINGS.level) for dof in error.output_dof]
     floor = error.noise_share()
     white = whiteness(error, model.sensors.names, model.inputs, covariance, noise_dof / (2 * len(power)), families)
-    chi2_local, nrms_local = _with_local_noise(found, fitted, raw, notes)
     return HeldOut(
         block.name,
         len(block.omega),
@@ -288,8 +286,7 @@ def _figures(
         error.chi2 / error.dof,
         interval(expected, error.dof, noise_dof, SETTINGS.level),
         before.chi2 / before.dof,
-        chi2_local,
-        nrms_local,
+        _local_chi2(found, fitted, raw, notes),
         error.output_chi2 / error.output_dof,
         np.array(of_output),
         _root(error.error, power),
@@ -325,21 +322,17 @@ def _root_all(error: PredictionError) -> float:
     return float(np.linalg.norm(error.error) / np.linalg.norm(error.block.Y))
 
 
-def _with_local_noise(
-    found: CampaignFit, fitted: Measured, raw: SpectralBlock, notes: list[str]
-) -> tuple[float, float]:
-    """chi-square per degree of freedom with the noise of the local polynomial model, and n.r.m.s. error expected from
-    that noise."""
+def _local_chi2(found: CampaignFit, fitted: Measured, raw: SpectralBlock, notes: list[str]) -> float:
+    """chi-square per degree of freedom with the noise of the local polynomial model."""
     if isinstance(fitted, FrequencyResponse):
-        return np.nan, np.nan
+        return float("nan")
     try:
         (block,) = measured_noise([raw], fitted, found.band_Hz)
         error = prediction_error(found.fit.model, block, derivative=False)
     except AvisError as failed:
         notes.append(f"record {raw.name}: no noise of a local polynomial model ({failed})")
-        return np.nan, np.nan
-    expected = np.sqrt(error.noise_share().sum()) / np.linalg.norm(block.Y)
-    return error.chi2 / error.dof, float(expected)
+        return float("nan")
+    return error.chi2 / error.dof
 
 
 def _in_time(
@@ -417,17 +410,16 @@ def verdict_of(figures: list[HeldOut]) -> str:
     def ratio(one: HeldOut) -> float:
         return one.chi2_per_dof / one.chi2_interval[1]
 
-    if again := [one for one in figures if one.repeats]:
+    off = [one for one in figures if ratio(one) > 1]
+    beyond = [one for one in off if _beyond(one)]
+    if not beyond and (again := [one for one in figures if one.repeats]):
         worst = max(again, key=lambda one: one.chi2_local)
         return (
             "the identified model does not explain the records; its error repeats in all of them (avis gap searches "
             f"for the cause): on record {worst.name} its residual is {percent(worst.nrms_all)} of the signal, r.m.s. "
-            f"(the noise of a local polynomial model is {percent(worst.nrms_local)}; start model "
-            f"{percent(worst.nrms_all_start)}), and chi-square per degree of freedom with this noise is "
-            f"{worst.chi2_local:.4g}"
+            f"(start model {percent(worst.nrms_all_start)}), {np.sqrt(worst.chi2_local):.3g} times the noise of a "
+            f"local polynomial model (chi-square per degree of freedom {worst.chi2_local:.4g})"
         )
-    off = [one for one in figures if ratio(one) > 1]
-    beyond = [one for one in off if _beyond(one)]
     worst = max(beyond or off or figures, key=ratio)
     if not off and all(one.uninformative for one in figures):
         judged = (
