@@ -15,6 +15,8 @@ from avis_ctrl.errors import AvisError, ComputationError, InputError
 
 # Errors of a full or failing disk: exit code 3.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+# First bytes of an HDF5 file.
+HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 @contextlib.contextmanager

@@ -137,11 +137,11 @@ def predict(
     avis gap.
     """
     from avis_ctrl.study.file_names import GAP_FILE
-    from avis_ctrl.study.files import require_output
+    from avis_ctrl.study.files import require_hdf5_output
     from avis_ctrl.study.gap_axis import is_axis_gap, write_axis_predictions
     from avis_ctrl.study.prediction_file import compared, prediction_errors
 
-    require_output(out, campaign)
+    require_hdf5_output(out, campaign)
     terminal = Terminal()
     if is_axis_gap(folder):
         several = write_axis_predictions(folder, [campaign], out)

@@ -125,11 +125,13 @@ def simulate_campaign(
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
-    from avis_ctrl.study.files import require_output
+    from avis_ctrl.study.files import require_hdf5_output, require_output
     from avis_ctrl.study.hidden_effects import rehearse_with_effects
     from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
-    for written in (out, write_plan, truth):
+    if out is not None:
+        require_hdf5_output(out, plan, rig, effects)
+    for written in (write_plan, truth):
         if written is not None:
             require_output(written, plan, rig, effects)
     if plan and (perturbed or orthogonal):
@@ -190,14 +192,14 @@ def convert(
     from avis_ctrl.measurement.campaign import Campaign, in_short
     from avis_ctrl.measurement.formats import parse_columns, read_measurements
     from avis_ctrl.measurement.formats.hdf5 import write_campaign, write_frequency_response
-    from avis_ctrl.study.files import require_output
+    from avis_ctrl.study.files import require_hdf5_output
 
     target = out or file
     if target is None:
         raise InputError("missing; expected the file to write", field="--out")
     if file is not None and out is not None:
         raise InputError(f"give the output file once; {file} and --out were both given", field="--out", value=str(out))
-    require_output(target, source)
+    require_hdf5_output(target, source)
     terminal = Terminal()
     measured = read_measurements(
         source,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.files import FULL, not_written, require_writable
+from avis_ctrl.files import FULL, HDF5, not_written, require_writable
 
 
 def open_folder(folder: str | Path, files: Sequence[str] = (), folders: Sequence[str] = ()) -> Path:
@@ -64,6 +64,20 @@ def require_output(out: Path, *inputs: Path | str | None) -> None:
             if one is not None and out.samefile(one):
                 raise InputError("expected a file other than the input file", field="--out", value=str(out))
     require_writable(out)
+
+
+def require_hdf5_output(out: Path, *inputs: Path | str | None) -> None:
+    """`require_output`; raises InputError also if the file exists and is no HDF5 file, such as a rig file named by a
+    slip."""
+    require_output(out, *inputs)
+    if out.is_file() and out.stat().st_size:
+        with out.open("rb") as file:
+            if file.read(len(HDF5)) != HDF5:
+                raise InputError(
+                    "this file exists and is no HDF5 file: give another name, or delete it",
+                    field="--out",
+                    value=str(out),
+                )
 
 
 def as_json(value: dict[str, Any]) -> bytes:

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -252,6 +253,19 @@ def test_what_is_read_is_never_written(tmp_path):
         with pytest.raises(InputError, match="other than the input file"):
             folders.require_output(out, "avis", None, campaign)
     folders.require_output(tmp_path / "new.h5", campaign, None, "avis")
+
+
+def test_a_file_of_another_kind_is_not_overwritten(tmp_path):
+    """A design file named as the output by a slip."""
+    design, old = tmp_path / "design.toml", tmp_path / "old.h5"
+    design.write_text("title = 'a day of work'\n")
+    with h5py.File(old, "w") as file:
+        file["x"] = 1.0
+    with pytest.raises(InputError, match="is no HDF5 file: give another name"):
+        folders.require_hdf5_output(design, "avis")
+    folders.require_hdf5_output(old, "avis")
+    folders.require_hdf5_output(tmp_path / "new.h5", "avis")
+    assert design.read_text().startswith("title")
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path):

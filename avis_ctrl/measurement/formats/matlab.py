@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import HDF5
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import matlab_records, matlab_v5, matlab_v73
 from avis_ctrl.measurement.formats.common import as_names, reading
@@ -51,7 +52,7 @@ def variables(path: Path) -> dict[str, Any]:
     """
     with path.open("rb") as stream:
         head = stream.read(128)
-    if head.startswith((b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")):
+    if head.startswith((b"MATLAB 7.3 MAT-file", HDF5)):
         return matlab_v73.variables(path)
     if head.startswith(b"MATLAB 5.0 MAT-file") and len(head) == 128:
         return matlab_v5.variables(path)

@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.files import HDF5
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import csv, hdf5, matlab, uff
 from avis_ctrl.measurement.formats.common import existing_file, reading
@@ -102,7 +103,7 @@ def _format(path: Path, head: bytes) -> str:
 
 def _is_hdf5(path: Path, head: bytes) -> bool:
     """By the signature; h5py also finds it behind a user block."""
-    if head.startswith(b"\x89HDF\r\n\x1a\n"):
+    if head.startswith(HDF5):
         return True
     try:
         return bool(h5py.is_hdf5(path))
