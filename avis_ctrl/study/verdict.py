@@ -9,6 +9,7 @@ import numpy as np
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rigid_body import COORDINATES
+from avis_ctrl.robust.musyn_iteration import STOPPED
 from avis_ctrl.simulation.design_check import SimulationCheck
 from avis_ctrl.study.at_rest import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
@@ -125,8 +126,15 @@ def check_requirements(
 
 
 def first_sentence(result: DesignResult) -> str:
-    """A sentence on instability, if the loop is unstable; otherwise on the requirements that are not met."""
-    return unstable(result) or _counted(result)
+    """A sentence on instability, if the loop is unstable; otherwise on the requirements that are not met. Before it,
+    whether the synthesis was stopped."""
+    early = "The synthesis was stopped before it had converged; let it finish before you judge the design. "
+    return early * stopped(result) + (unstable(result) or _counted(result))
+
+
+def stopped(result: DesignResult) -> bool:
+    """Whether the user stopped the synthesis before it had converged."""
+    return any(STOPPED in one.notes for one in result.controllers if one.name == "mu")
 
 
 def unstable(result: DesignResult) -> str:
@@ -214,6 +222,8 @@ def refuse_unstable(result: DesignResult) -> None:
 def _relaxed(result: DesignResult, moving: Sequence[str]) -> str:
     """What to change if the designed controller itself makes a plant unstable. moving : axes of the unstable motion."""
     mu = result.controller("mu")
+    if stopped(result):
+        return "run it again to the end: the synthesis was stopped before it had converged"
     if not mu.stability.upper < 1:
         return (
             f"the specification is too demanding: mu of the controller is {mu.mu.upper:.3g} and must be below 1; relax "

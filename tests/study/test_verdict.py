@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.robust.musyn_iteration import STOPPED
 from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import PlantCheck
 from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
@@ -26,7 +27,7 @@ def result(plants, culprit=None, asked=()) -> DesignResult:
     check = SimpleNamespace(plants=tuple(plants), duration_s=20.0, false_alarm=0.01)
     loop = Simulated(None, check, None, 1.0, culprit)
     rows = (*check_loop(check), *asked)
-    return DesignResult(*(None,) * 5, rows, None, None, loop, {}, 1.0)
+    return DesignResult(None, None, None, (), (), rows, None, None, loop, {}, 1.0)
 
 
 def test_a_value_beyond_its_limit_does_not_look_equal_to_it():
@@ -44,6 +45,16 @@ def test_an_unstable_loop_comes_before_requirements_that_are_met():
         refuse_unstable(found)
     assert refused.value.exit_code == 3 and refused.value.next_step
     assert [row.met for row in found.requirements] == [False, True, False, True]
+
+
+def test_a_synthesis_that_was_stopped_says_so_first():
+    """Its controller is one of the first steps: no reason to relax the specification."""
+    mu = SimpleNamespace(name="mu", notes=(STOPPED,), stability=SimpleNamespace(upper=1.2))
+    found = replace(result([plant("nominal", 1.01)], replace(CULPRIT, kind="controller")), controllers=(mu,))
+    assert first_sentence(found).startswith("The synthesis was stopped") and "UNSTABLE" in first_sentence(found)
+    with pytest.raises(ComputationError) as refused:
+        refuse_unstable(found)
+    assert "run it again to the end" in refused.value.next_step
 
 
 @pytest.mark.parametrize(
@@ -110,7 +121,9 @@ def test_without_bounds_none_are_said_to_hold():
 )
 def test_the_advice_fits_the_cause(stability, moving, advice):
     """Axes are to be added only if axes outside the design move and the design itself is stable for its set."""
-    mu = SimpleNamespace(name="mu", stability=SimpleNamespace(upper=stability), mu=SimpleNamespace(upper=3.59))
+    mu = SimpleNamespace(
+        name="mu", notes=(), stability=SimpleNamespace(upper=stability), mu=SimpleNamespace(upper=3.59)
+    )
     found = result([plant("worst case", 1.00003)], Culprit("worst case", 1.00003, 18.2, 0.03, moving, "controller"))
     found = replace(found, controllers=(mu,), design=SimpleNamespace(keep=["z", "phi_x"]))
     with pytest.raises(ComputationError) as refused:
