@@ -8,6 +8,7 @@ from functools import partial, reduce
 import numpy as np
 
 from avis_ctrl.errors import InputError
+from avis_ctrl.gap.effects.base import EffectParameter
 from avis_ctrl.gap.model_files import effect_at
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
@@ -58,20 +59,22 @@ def _active(model: TableModel, plan: EffectPlan, field: str) -> ActiveEffect:
     known = {one.name: one for one in begun.parameters}
     for name, value in plan.values.items():
         if name not in known:
-            listed = ", ".join(
-                f"{one.name} ({one.description}; {one.low:g} to {one.high:g} {one.unit})" for one in begun.parameters
-            )
+            listed = ", ".join(f"{one.name} ({one.description}; {_range(one)})" for one in begun.parameters)
             raise InputError(f"expected parameters of this effect: {listed}", field=f"{field}.values", value=name)
         one = known[name]
         if not one.low <= value <= one.high:
-            raise InputError(
-                f"expected {one.low:g} to {one.high:g} {one.unit}", field=f"{field}.values.{name}", value=value
-            )
+            raise InputError(f"expected {_range(one)}", field=f"{field}.values.{name}", value=value)
     values = begun.by_name | plan.values
     if all(values[name] == one.none for name, one in known.items() if one.linear or not plan.values):
+        strengths = [name for name, one in known.items() if one.linear] or list(known)
         raise InputError(
-            f"expected a value with an effect; the parameters are {', '.join(known)}",
+            f"with these values the effect does nothing; give at least one of {', '.join(strengths)}",
             field=f"{field}.values",
             value=plan.values,
         )
     return begun.at(list(values.values()))
+
+
+def _range(one: EffectParameter) -> str:
+    """Limits of a parameter, with its unit."""
+    return f"{one.low:g} to {one.high:g}{'' if one.unit == '1' else f' {one.unit}'}"

@@ -73,6 +73,7 @@ WRONG = [
     ("avis", ("loop_delay_s", "loop_delay_ms"), "acquisition.loop_delay_ms", "expected loop_delay_s"),
     ("avis", ("mass_kg = 500.0", ""), "payload.mass_kg", "missing"),
     ("avis", ("[ambient]", "[ambience]"), "ambience", "did you mean ambient"),
+    ("avis", ("[ambient]", "[tolerances]\nplace_m = 1\n[ambient]"), "tolerances.place_m", "1 mm is 0.001"),
     (
         "avis",
         ("20.0e3, 21.0e3, 45.0e3", "20.0e3, -21.0e3, 45.0e3"),

@@ -93,7 +93,7 @@ def test_a_plan_with_effects_is_written_as_it_is_read(tmp_path):
         ({"name": "sensor_gain", "place": "Sz9", "values": {"gain": 1.2}}, r"effect\[1\].place.*Sz9"),
         ({"name": "loop_delay", "values": {"delay": 1.0}}, r"effect\[1\].values.*extra_delay_s.*0 to 0.2 s"),
         ({"name": "loop_delay", "values": {"extra_delay_s": 1.0}}, r"extra_delay_s.*0 to 0.2 s"),
-        ({"name": "loop_delay"}, r"effect\[1\].values.*with an effect.*extra_delay_s"),
+        ({"name": "loop_delay"}, r"effect\[1\].values.*does nothing.*extra_delay_s"),
         ({"name": "loop_delay", "values": {"extra_delay_s": "long"}}, r"extra_delay_s.*number"),
         ({"nam": "loop_delay"}, "nam"),
     ],
