@@ -1,14 +1,15 @@
 """The table line by line: the operators that effects change before the response is computed.
 
     D x = T v + F_w w + transient - internal forces,     D = s^2 M + G^T z_pp G + Z_0 + G^T z_pf G_c B (s^2 M + Z_e)
-    F_w = G^T z_pf G_c H_w + Z_f,        y = S sense (rows x) + aliases
+    F_w = G^T z_pf G_c H_w + Z_f,        y = S sense (rows x - against q_c) + aliases
 
 x contains the six coordinates q of the payload and the coordinates that effects add (its modes). G (n_g, n_q) maps x to
 the displacement of every mount along x, y, z at the payload, G_c that of the chassis. z_pp and z_pf (n, n_g) are the
 complex stiffnesses of the mounts: force on the payload due to its own displacement, and due to that of the chassis;
 they are equal without mass inside the mount. Z_0 is the dynamic stiffness of everything else that supports the payload,
 Z_e its part that effects add, Z_f its part that moves with the floor. The chassis follows the floor displacement w
-through H_w and recoils with B; on a stiff floor H_w is one and B is zero.
+through H_w and recoils with B; on a stiff floor H_w is one and B is zero. A position sensor reads against the chassis,
+whose displacement is q_c.
 """
 
 from __future__ import annotations
@@ -86,7 +87,8 @@ class Operators:
         infinite without a mass; the mount's own c bypasses the mass. payload_share : (n_g,) fraction of the mount's
         compliance between that mass and the payload.
     extra, extra_floor : (n, 6, 6) and (n, 6, 3) N/m, dynamic stiffness on q, and force per floor displacement.
-    rows : (1 or n, n_y, 6) displacement measured by each sensor. sense : (n, n_y) sensor chain and s^p, without
+    rows : (1 or n, n_y, 6) displacement measured by each sensor. against : (1, n_y, 6) the same of the chassis, which
+        is subtracted; zero for inertial sensors. sense : (n, n_y) sensor chain and s^p, without
         sensitivity.
     sensor_gain : (n_y,) factors. drive : (n, n_u) factors of the volts. delay_s, amplifier_corner_Hz : of the drives.
     inner : (n, 6, m) forces on q due to unit impulses on internal states of effects. decays : the same for first-order
@@ -108,6 +110,7 @@ class Operators:
         self.internal_omega, self.internal_damping = np.full(n_g, np.inf), np.zeros(n_g)
         self.payload_share = np.full(n_g, 0.5)
         self.rows: np.ndarray = base.matrices.R[None]
+        self.against: np.ndarray = base.sensors.relative[:, None] * self.rows
         self.sense = base.sensors.sense(omega)
         self.sensor_gain = np.ones(len(base.sensors.names))
         self.drive: np.ndarray = np.ones((1, len(base.actuators)), complex)
@@ -199,7 +202,26 @@ class Assembled:
     @cached_property
     def left(self) -> np.ndarray:
         """(n, n_y, n_q) y per force on the coordinates."""
-        return self.gain * self.ops.sense[:, :, None] * (self.rows @ self.inverse)
+        rows = self.rows
+        if self.ops.recoil is not None and np.any(self.ops.against):
+            rows = np.broadcast_to(rows, (len(self.ops.s), *rows.shape[1:])).astype(complex)
+            rows[:, :, :N_Q] += self.against_recoil @ self.ops.borne(self.M)
+        return self.gain * self.ops.sense[:, :, None] * (rows @ self.inverse)
+
+    @property
+    def against_recoil(self) -> np.ndarray:
+        """(n, n_y, 6) reading due to the recoil of the chassis per force on it."""
+        assert self.ops.recoil is not None
+        return np.asarray(self.ops.against @ self.ops.recoil)
+
+    @property
+    def y_of_states(self) -> np.ndarray:
+        """(n, n_y, m) y due to the unit initial states of `forces_of_states`."""
+        found = self.left @ self.forces_of_states
+        if self.ops.recoil is not None and np.any(self.ops.against):
+            of_chassis = np.concatenate([self._chassis_states(row) for row in np.eye(found.shape[2])], axis=2)
+            found = found - self.gain * self.ops.sense[:, :, None] * (self.ops.against @ of_chassis)
+        return found
 
     @property
     def gain(self) -> np.ndarray:

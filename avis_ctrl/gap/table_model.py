@@ -291,7 +291,7 @@ class TableModel(Table):
         if not any(one.effect.holds_states for one in self.effects):
             return np.zeros((len(omega), n_y, 0), complex)
         made = self.assembled(omega)
-        return made.left @ made.forces_of_states
+        return made.y_of_states
 
     def driven(self, omega: np.ndarray, U: np.ndarray, derivative: bool = True) -> Driven:
         """As `ResponseModel.driven`: y from spectra of the inputs, and its derivative with respect to the free

@@ -67,8 +67,8 @@ class DrivenTable:
         """(n, n_y, m) sensor outputs for a motion x; aliases pass the chain far above its corners."""
         base = self.made.ops.base
         moved = self.made.rows @ x
-        if np.any(against := base.sensors.relative):
-            moved = moved - (against[:, None] * base.matrices.R) @ self.made.chassis(x, self.w)
+        if np.any(against := self.made.ops.against):
+            moved = moved - against @ self.made.chassis(x, self.w, self.acting.inner)
         if self.acting.reading is not None:
             moved = moved + self.acting.reading
         output = self.sense * moved
@@ -114,6 +114,7 @@ class TableResponse(DrivenTable):
         inertial = per_force[:, :, :N_Q]
         if ops.recoil is not None:
             inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
+            inertial = inertial - self.gain * self.sense * made.against_recoil
         operands = Operands(
             ops.base.sensors,
             model.matrices,
@@ -126,8 +127,8 @@ class TableResponse(DrivenTable):
             self.folded,
             self.x[:, :N_Q],
             made.follow(self.w),
-            made.chassis(self.x, self.w),
-            self.Y,
+            made.chassis(self.x, self.w, self.acting.inner),
+            self.Y if self.acting.output is None else self.Y - self.acting.output,
         )
         dY = operands.derivative(model.names, d, more)
         if made.n_q > N_Q:

@@ -134,7 +134,8 @@ def _through_chassis(score: Score) -> list[tuple[np.ndarray, np.ndarray]]:
         for part in score.parts:
             made, response = part.made, part.response
             through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
-            found.append((response.left[:, :, :6] @ through, -(part.s**2) * (made.M @ response.x[:, :6])))
+            moved = response.left[:, :, :6] @ through - response.gain * response.sense * made.ops.against
+            found.append((moved, -(part.s**2) * (made.M @ response.x[:, :6])))
         score.kept["through chassis"] = found
     return score.kept["through chassis"]
 

@@ -112,9 +112,11 @@ class SensorMisalignment(OfSensor):
         direction = own.copy()
         for name, angle in values.items():
             direction = direction + np.tan(np.radians(angle)) * np.eye(3)["xyz".index(name.split("_")[1])]
-        rows, G = ops.rows.copy(), point_map(position)
-        rows[:, ops.sensor(place)] += direction / np.linalg.norm(direction) @ G - own @ G
-        ops.rows = rows
+        turned = (direction / np.linalg.norm(direction) - own) @ point_map(position)
+        k, rows, against = ops.sensor(place), ops.rows.copy(), ops.against.copy()
+        rows[:, k] += turned
+        against[:, k] += ops.base.sensors.relative[k] * turned
+        ops.rows, ops.against = rows, against
 
 
 @register
@@ -145,7 +147,7 @@ class TiltCoupling(Effect):
         per_tilt = values["gravity_m_per_s2"] / ops.s**2
         axes = ops.base.rig.sensor_axes()
         for k, name in enumerate(ops.base.sensors.names):
-            direction = axes[name][1]
+            direction = (1 - ops.base.sensors.relative[k]) * axes[name][1]  # a position sensor reads no gravity
             rows[:, k, 3] += direction[1] * per_tilt
             rows[:, k, 4] -= direction[0] * per_tilt
         ops.rows = rows

@@ -70,11 +70,12 @@ def pairs(names: tuple[str, ...]) -> tuple[str, ...]:
 def mix(ops: Operators, into: str, shares: Values) -> None:
     """Add fractions of other sensors' signals to one sensor."""
     j, gain = ops.sensor(into), ops.base.sensors.sensitivity * ops.sensor_gain
-    rows = np.array(ops.rows)
+    rows, against = np.array(ops.rows), np.array(ops.against)
     for name, share in shares.items():
         i = ops.sensor(name)
         rows[:, j] = rows[:, j] + share * gain[i] / gain[j] * ops.rows[:, i]
-    ops.rows = rows
+        against[:, j] = against[:, j] + share * gain[i] / gain[j] * ops.against[:, i]
+    ops.rows, ops.against = rows, against
 
 
 class SensorCrosstalk(UnnamedFault):
