@@ -12,6 +12,7 @@ import pytest
 from test_cli import ONE_THREAD
 
 import avis_ctrl
+from avis_ctrl.files import HDF5
 from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.measurement.formats.hdf5_writing import SETTINGS, PatientFile
 from avis_ctrl.rigs import load_rig
@@ -69,7 +70,8 @@ def given(tmp_path_factory) -> dict[str, str]:
 )
 def test_a_file_that_the_system_refuses(arguments, out, at_byte, given, tmp_path):
     path = tmp_path / out
-    path.write_bytes(b"old")
+    old = (HDF5 if out.endswith(".h5") else b"") + b"old"  # only a file of the same kind may be overwritten
+    path.write_bytes(old)
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(at_byte), *(given.get(one, one) for one in arguments), str(path)],
         capture_output=True,
@@ -81,7 +83,7 @@ def test_a_file_that_the_system_refuses(arguments, out, at_byte, given, tmp_path
     assert done.returncode == 3, done.stderr
     assert done.stderr.startswith("avis: ") and done.stderr.count("\n") == 1
     assert f"{path} was not written" in done.stderr and "File too large" in done.stderr
-    assert path.read_bytes() == b"old" and os.listdir(tmp_path) == [out]
+    assert path.read_bytes() == old and os.listdir(tmp_path) == [out]
 
 
 def test_what_cannot_be_printed_is_one_line(given, tmp_path):
