@@ -104,9 +104,11 @@ def identify(
         progress("uncertainty for design")
         try:
             more, made = design_start(found, template)
-            then = f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
-            if not found.validation.explains:
-                then = f"; the model does not explain the records; next: avis gap {measurement} --rig {rig} --out DIR"
+            then = (
+                f"; next: avis design {folder / 'design.toml'} --out {folder / 'design'}"
+                if found.validation.explains
+                else f"; the model does not explain the records; next: avis gap {measurement} --rig {rig} --out DIR"
+            )
         except AvisError as error:
             # The identification is valid without the design files.
             more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"

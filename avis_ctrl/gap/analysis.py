@@ -482,7 +482,7 @@ def _opening(
     """The opening sentences: verdict and size of the gap."""
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {percent(after.noise_nrmse)}"
-    also = f" Below 1 % of the gap: {joined([one.name for one in traces])}." if traces else ""
+    also = f" Effects that explain less than 1 % of the gap: {joined([one.name for one in traces])}." if traces else ""
     fitted = "all values of the rig file fitted within their tolerances"
     if verdict == "none":
         return (

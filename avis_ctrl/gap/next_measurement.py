@@ -91,7 +91,7 @@ def of_unexplained(places: Sequence[Where], records: Sequence[RecordGap]) -> str
             "grows faster is not, and one that stays the same is noise or comes through the floor."
         )
     power, std = growth
-    rise = f"{where}The residual beyond noise varies as level to the power {power:.2f} +- {std:.2g}"
+    rise = f"{where}The residual beyond noise varies as the level to the power {power:.2f} +- {std:.2g}"
     if abs(power) <= max(SETTINGS.within, 2 * std) and abs(power) < abs(power - 1):
         return (
             f"{rise}: it may not depend on the drives. Record the table at rest with the floor measured; "

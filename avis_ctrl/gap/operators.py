@@ -203,22 +203,23 @@ class Assembled:
     def left(self) -> np.ndarray:
         """(n, n_y, n_q) y per force on the coordinates."""
         rows = self.rows
-        if self.ops.recoil is not None and np.any(self.ops.against):
+        if self.read_recoil is not None:
             rows = np.broadcast_to(rows, (len(self.ops.s), *rows.shape[1:])).astype(complex)
-            rows[:, :, :N_Q] += self.against_recoil @ self.ops.borne(self.M)
+            rows[:, :, :N_Q] += self.read_recoil @ self.ops.borne(self.M)
         return self.gain * self.ops.sense[:, :, None] * (rows @ self.inverse)
 
-    @property
-    def against_recoil(self) -> np.ndarray:
-        """(n, n_y, 6) reading due to the recoil of the chassis per force on it."""
-        assert self.ops.recoil is not None
+    @cached_property
+    def read_recoil(self) -> np.ndarray | None:
+        """(n, n_y, 6) recoil of the chassis, as position sensors read it, per force on it; None without either."""
+        if self.ops.recoil is None or not np.any(self.ops.against):
+            return None
         return np.asarray(self.ops.against @ self.ops.recoil)
 
     @property
     def y_of_states(self) -> np.ndarray:
         """(n, n_y, m) y due to the unit initial states of `forces_of_states`."""
         found = self.left @ self.forces_of_states
-        if self.ops.recoil is not None and np.any(self.ops.against):
+        if self.read_recoil is not None:
             of_chassis = np.concatenate([self._chassis_states(row) for row in np.eye(found.shape[2])], axis=2)
             found = found - self.gain * self.ops.sense[:, :, None] * (self.ops.against @ of_chassis)
         return found

@@ -267,7 +267,8 @@ class Gap(Findings):
         then "mains_hum", if there is any, without the polluted lines, and one for each effect that a model explains.
     where : location of the gap after re-identification. remaining : the same after the named effects.
     noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
-    baseline, updated : models (without named effects, updated is the baseline with all tolerances fitted).
+    baseline, updated : models (without named effects, updated is the baseline with all values of the rig file fitted
+        within their tolerances).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
     held_out : the held-out data and the reason for their choice. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.

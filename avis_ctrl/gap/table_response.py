@@ -114,7 +114,8 @@ class TableResponse(DrivenTable):
         inertial = per_force[:, :, :N_Q]
         if ops.recoil is not None:
             inertial = inertial + through @ (made.z_pf[:, :, None] * (ops.mounts.chassis @ ops.recoil))
-            inertial = inertial - self.gain * self.sense * made.against_recoil
+        if made.read_recoil is not None:
+            inertial = inertial - self.gain * self.sense * made.read_recoil
         operands = Operands(
             ops.base.sensors,
             model.matrices,

@@ -97,6 +97,11 @@ class HeldOut:
         return self.chi2_per_dof <= self.chi2_interval[1]
 
     @property
+    def beyond_noise(self) -> bool:
+        """Whether chi-square and r.m.s. error are above their intervals."""
+        return not self.consistent and self.nrms_all > self.nrms_all_interval[1]
+
+    @property
     def repeats(self) -> bool:
         """Whether the residual is an error of the model that repeats in all records: far above the noise of a local
         polynomial model."""
@@ -142,8 +147,8 @@ class Validation:
 
     @property
     def explains(self) -> bool:
-        """Whether the errors on held-out data are not larger than noise, in r.m.s."""
-        return not any(one.repeats or _beyond(one) for one in self.held_out)
+        """Whether no error on held-out data is beyond noise in r.m.s., and none repeats in all records."""
+        return not any(one.beyond_noise or one.repeats for one in self.held_out)
 
     def as_dict(self) -> dict[str, Any]:
         """Values for a file, without the arrays of figures."""
@@ -399,19 +404,14 @@ def _overlay(found: CampaignFit, fitted: Measured, held_out: Measured, notes: li
         return None
 
 
-def _beyond(one: HeldOut) -> bool:
-    """Whether chi-square and r.m.s. error are above their intervals."""
-    return not one.consistent and one.nrms_all > one.nrms_all_interval[1]
-
-
 def verdict_of(figures: list[HeldOut]) -> str:
     """Verdict on the record that fits worst; if some records exceed what noise explains, on the worst of these."""
 
     def ratio(one: HeldOut) -> float:
         return one.chi2_per_dof / one.chi2_interval[1]
 
-    off = [one for one in figures if ratio(one) > 1]
-    beyond = [one for one in off if _beyond(one)]
+    off = [one for one in figures if not one.consistent]
+    beyond = [one for one in off if one.beyond_noise]
     if not beyond and (again := [one for one in figures if one.repeats]):
         worst = max(again, key=lambda one: one.chi2_local)
         return (

@@ -22,7 +22,7 @@ from avis_ctrl.rigs.converter import Converter, white_density
 from avis_ctrl.rigs.equipment import Ambient, Electronics
 from avis_ctrl.rigs.file_errors import Values
 from avis_ctrl.rigs.floor_motion import DERIVATIVES, Quantity
-from avis_ctrl.rigs.key_types import Axis, Direction, LengthDeviation, Name, NotNegative, Percent, Point, Positive
+from avis_ctrl.rigs.key_types import Axis, Direction, LengthStd, Name, NotNegative, Percent, Point, Positive
 
 Triple = tuple[float, ...]
 
@@ -309,11 +309,11 @@ class Tolerances(Values):
     sensor, about both normals.
     """
 
-    place_m: LengthDeviation = 0.001
+    place_m: LengthStd = 0.001
     direction_rad: NotNegative = 0.005
     actuator_gain_percent: Percent = 1.0
     sensor_gain_percent: Percent = 1.0
     sensor_corner_percent: Percent = 1.0
     sensor_damping_percent: Percent = 3.0
-    centre_of_mass_m: LengthDeviation = 0.001
+    centre_of_mass_m: LengthStd = 0.001
     product_of_inertia_kgm2: NotNegative = 0.2

@@ -17,13 +17,13 @@ class RigLimits:
         points the inertia is lost in the round-off of m r^2.
     largest : maximum size of any number [SI unit of its key]: no value of a table comes near it, and products of such
         numbers are finite.
-    least_known_m : maximum standard deviation of a position [m]: far more than anyone measures; a larger number is in
-        millimetres.
+    position_std_m : maximum standard deviation of a position [m]: far more than that of any measurement; a larger
+        number was meant in millimetres.
     """
 
     farthest_m: float = 100.0
     largest: float = 1e12
-    least_known_m: float = 0.1
+    position_std_m: float = 0.1
 
 
 LIMITS = RigLimits()
@@ -39,16 +39,16 @@ def _not_far(length: float) -> float:
     return length
 
 
-def _length_deviation(length: float) -> float:
-    if length > LIMITS.least_known_m:
+def _not_in_millimetres(length: float) -> float:
+    if length > LIMITS.position_std_m:
         raise ValueError(
-            f"expected a standard deviation in metres, at most {LIMITS.least_known_m:g}; {length:g} mm is "
+            f"expected a standard deviation in metres, at most {LIMITS.position_std_m:g}; {length:g} mm is "
             f"{1e-3 * length:g}"
         )
     return length
 
 
-LengthDeviation = Annotated[float, Field(ge=0, strict=True), AfterValidator(_length_deviation)]
+LengthStd = Annotated[float, Field(ge=0, strict=True), AfterValidator(_not_in_millimetres)]
 Length = Annotated[float, Field(strict=True), AfterValidator(_not_far)]
 PositiveLength = Annotated[float, Field(gt=0, strict=True), AfterValidator(_not_far)]
 _THREE = Field(min_length=3, max_length=3, strict=False)  # lists of a file, tuples in a rig

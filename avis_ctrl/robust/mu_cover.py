@@ -104,10 +104,9 @@ def _positive(N: StateSpace, scalings: LmiScalings, omega: Array) -> Array:
     return finite & (np.linalg.eigvalsh(root @ F @ dagger(root))[:, 0] > 1e-10)
 
 
-def near_poles(N: StateSpace) -> Array:
-    """Frequencies [rad/s] >= 0 at the top and on the flanks of the resonances of N."""
-    poles = N.poles() if N.nstates else np.zeros(0)
-    return np.abs(np.multiply.outer(SETTINGS.beside, np.abs(poles.real)) + np.abs(poles.imag))
+def near_poles(poles: Array) -> Array:
+    """Frequencies [rad/s] >= 0 at the top and on the flanks of the resonances."""
+    return np.abs(np.multiply.outer(SETTINGS.beside, poles.real) + poles.imag).ravel()
 
 
 def proved_intervals(N: StateSpace, scalings: LmiScalings, inside: Interval, also: Array) -> list[Interval]:
@@ -115,7 +114,7 @@ def proved_intervals(N: StateSpace, scalings: LmiScalings, inside: Interval, als
     tested, such as those of `near_poles`."""
     low, high = inside
     crossings = possible_crossings(N, scalings)
-    tested = np.unique(np.concatenate([crossings, (crossings[1:] + crossings[:-1]) / 2, also.ravel()]))
+    tested = np.unique(np.concatenate([crossings, (crossings[1:] + crossings[:-1]) / 2, also]))
     edges = np.concatenate([[low], tested[(tested > low) & (tested < high)], [high]])
     middles = np.array([midpoint(a, b) for a, b in pairwise(edges.tolist())])
     at_edge, between = np.split(_positive(N, scalings, np.concatenate([edges, middles])), [edges.size])
@@ -179,12 +178,14 @@ class Cover:
                 self.level *= 1 + self.slack * 2.0**self.widened
                 self.looked, self.widened = 0, self.widened + 1
             self._one_round()
-        self.gaps += doubtful(self.N, band)
+        self.gaps += doubtful(self.N.A, self._poles, band)
         return self
 
     @cached_property
-    def _near_poles(self) -> Array:
-        return near_poles(self.N)
+    def _poles(self) -> Array:
+        """Poles of N in the upper half plane."""
+        poles = self.N.poles() if self.N.nstates else np.zeros(0, complex)
+        return poles[poles.imag >= 0]
 
     def _one_round(self) -> None:
         unit = self.scaled(self.level)
@@ -196,7 +197,9 @@ class Cover:
                 open_gaps.append(gap)
                 continue
             self.intervals += 1
-            self.gaps += _without(gap, proved_intervals(unit, selected(shared.scalings, k), gap, self._near_poles))
+            self.gaps += _without(
+                gap, proved_intervals(unit, selected(shared.scalings, k), gap, near_poles(self._poles))
+            )
         if open_gaps:
             self._split_or_raise(unit, open_gaps)
 
@@ -220,16 +223,20 @@ class Cover:
             self.raised_at.append(float(above[worst]))
 
 
-def doubtful(N: StateSpace, band: Interval) -> list[Interval]:
+def distance_to_singular(points: Array, A: Array) -> Array:
+    """(k,) smallest singular value of s I - A at points s (k,): the norm of the smallest change of A that moves a pole
+    there."""
+    return np.asarray(np.linalg.svd(points[:, None, None] * np.eye(len(A)) - A, compute_uv=False)[:, -1])
+
+
+def doubtful(A: Array, poles: Array, band: Interval) -> list[Interval]:
     """Parts of a band around poles where the relative error of the response by round-off may be too large: the
     backward error n eps |A| of a solution of n equations over the smallest singular value of j omega I - A."""
-    if not N.nstates:
+    if not poles.size:
         return []
-    poles = N.poles()
-    at = 1j * np.abs(poles.imag)
-    distance = np.linalg.svd(at[:, None, None] * np.eye(N.nstates) - N.A, compute_uv=False)[:, -1]
-    poor = N.nstates * np.finfo(float).eps * np.linalg.norm(N.A, 2) > SETTINGS.response_error * distance
-    ends = np.abs(poles.imag[poor]) + np.multiply.outer([-1, 1], np.abs(poles.real[poor]))
+    error = len(A) * np.finfo(float).eps * np.linalg.norm(A, 2) / SETTINGS.response_error
+    poor = poles[distance_to_singular(1j * poles.imag, A) < error]
+    ends = poor.imag + np.multiply.outer([-1, 1], np.abs(poor.real))
     return [(low, high) for low, high in np.clip(ends, *band).T.tolist() if low < high]
 
 

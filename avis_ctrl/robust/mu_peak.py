@@ -22,7 +22,7 @@ from avis_ctrl.lti import StateSpace, balance
 from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_frequency
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
-from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of
+from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, distance_to_singular
 from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
 from avis_ctrl.robust.mu_lmi import Array, joined, selected
 from avis_ctrl.robust.mu_lower import SETTINGS as LOWER
@@ -235,8 +235,7 @@ def _not_stable(N: StateSpace) -> complex | None:
     size = np.linalg.norm(A, 2)
     close = poles[(growth >= -SETTINGS.near * size) & (poles.imag >= 0)]
     points = close / np.abs(close) if N.dt else 1j * close.imag
-    distances = np.linalg.svd(points[:, None, None] * np.eye(N.nstates) - A, compute_uv=False)[:, -1]
-    doubtful = close[distances <= SETTINGS.round_off * size]
+    doubtful = close[distance_to_singular(points, A) <= SETTINGS.round_off * size]
     return complex(doubtful[np.argmax(doubtful.real)]) if doubtful.size else None
 
 

@@ -40,7 +40,8 @@ class PayloadFlexibleMode(Effect):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         names = mount_geometry(model.rig).names
         driven = np.any(shape_rows(model.rig, model.actuators, model.sensors.names)[0], axis=0)
-        damping, found = LIBRARY.mode_damping, list[EffectParameter]()
+        damping = LIBRARY.mode_damping
+        found: list[EffectParameter] = []
         for k in range(COUNTS[place.partition("/")[2]]):
             of, of_mode = ("", "of the mode") if k == 0 else (f"_{k + 1}", f"of mode {k + 1}")
             found += [

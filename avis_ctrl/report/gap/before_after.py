@@ -60,8 +60,8 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
     return Figure(
         "gap_spectrum",
         "The gap on held-out data: power of the residual relative to that of the "
-        "measured noise, by frequency band. For a complete model the mean is 1, the worst of "
-        f"{heat.before.shape[1]} (outputs of each record) a little more.",
+        "measured noise, by frequency band. For a complete model the mean is 1, and the "
+        f"largest of the {heat.before.shape[1]} values, one per output and record, a little more.",
         panels,
         2,
         0.95,

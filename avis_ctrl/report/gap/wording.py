@@ -18,7 +18,7 @@ from avis_ctrl.uncertain_value import with_prefix
 CLAIMS = {
     "none": "Verdict: none. The parameters of the rig were re-identified, and the other values of the rig file were "
     "fitted with their tolerances as standard deviations. The residual is noise, or less than 1 % of the "
-    "response, and no effect but traces is named. An effect "
+    "response, and no effect is named except traces. An effect "
     "can still be present if it is too weak for this campaign, if these records do not excite it, or if "
     "the parameters of the rig can imitate it.",
     "explained": "Verdict: explained. On held-out records the re-identified model has a residual beyond noise. "
@@ -29,7 +29,7 @@ CLAIMS = {
     "better, not complete.",
     "unexplained": "Verdict: unexplained. Model and held-out records disagree. Neither refitted values nor any effect "
     "of the library that meets all conditions for being named explains the difference. The updated model "
-    "contains no effect but traces.",
+    "contains no effects except traces.",
 }
 # The claim if only the increased noise of some sensors is unexplained.
 RAISED = (
