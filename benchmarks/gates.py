@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 from scipy.signal import chirp
 from scipy.stats import beta
 from threadpoolctl import threadpool_limits
@@ -152,20 +153,19 @@ def truth_campaign(seed: int) -> tuple[Campaign, str, bool]:
     effects = hidden_effects(plant, rng, band, float(levels.max()), 400.0)
     for effect in effects:
         (cases.LIBRARY | cases.OUTSIDE_LIBRARY)[effect.name].apply(plant, effect)
-    faulty = any("range_V" in effect.parameters or effect.name == "dropped_samples" for effect in effects)
+    faulty = any(
+        "range_V" in effect.parameters or effect.name in ("dropped_samples", "clock_rate_error") for effect in effects
+    )
     slope, measured, before = float(rng.uniform(0, 1)), bool(rng.random() < 0.5), round(SETTLE_S * rate)
     records, start = [], 0.0
     for k, (shape, level) in enumerate(zip(shapes, levels, strict=True)):
-        floor = (
-            floor_motion(
-                np.random.default_rng((seed, 2, k)),
-                before + len(shape) + 1,
-                rate,
-                rig.ambient.floor_velocity_rms_m_per_s,
-                slope,
-            )
-            * plant.floor_factor
-        )
+        floor = floor_motion(
+            np.random.default_rng((seed, 2, k)),
+            before + len(shape) + 1,
+            rate,
+            rig.ambient.floor_velocity_rms_m_per_s,
+            slope,
+        ) * np.tile(np.broadcast_to(plant.floor_factor, 3), 3)
         while True:
             u, draw = level * shape, np.random.default_rng((seed, 3, k))
             y = cases.run(plant, u, floor, before, start, draw)[0]
@@ -274,6 +274,14 @@ def _spike(of: Signals, rng: np.random.Generator, names: tuple[str, ...]) -> set
     return {names[j]}
 
 
+def _two_clocks(of: Signals, rng: np.random.Generator) -> set[str]:
+    rate = float(rng.choice([-1, 1]) * np.exp(rng.uniform(np.log(2e-5), np.log(1e-3))))
+    for one in of:
+        t = np.arange(len(one[1]))
+        one[1] = make_interp_spline(t, one[1], k=5)(np.clip(t * (1 - rate), 0, t[-1]))
+    return set()
+
+
 def _noise(x: np.ndarray) -> np.ndarray:
     return 1e-3 * np.random.default_rng(int(1e6 * abs(x[1])) + 1).standard_normal(len(x))
 
@@ -291,6 +299,7 @@ FAULTS: dict[str, tuple[tuple[str, ...], Fault]] = {
         lambda of, rng, u, y: _each(of, 1, rng, y, lambda x: np.clip(x, -0.6 * np.abs(x).max(), 0.6 * np.abs(x).max())),
     ),
     "samples lost": (("missing samples",), lambda of, rng, u, y: _lost(of, rng)),
+    "two clocks": (("sample clock",), lambda of, rng, u, y: _two_clocks(of, rng)),
     "block repeated": (("missing samples",), lambda of, rng, u, y: _repeated(of, rng)),
     "hum": (("hum",), lambda of, rng, u, y: _each(of, 1, rng, y, _hum)),
     "drift within records": (("periodicity",), lambda of, rng, u, y: _drift(of)),

@@ -221,7 +221,11 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
     for step in fits.steps:
         label = step.label
-        why = _refusal(fits.best, step, probability[label], data, held, settings)
+        why = (
+            "the delay of y after u drifts in the records (gate sample clock)"
+            if prepared.faults.drifting_delay
+            else _refusal(fits.best, step, probability[label], data, held, settings)
+        )
         if why:
             one = fits.best.model.effect(label)
             refused[label] = (

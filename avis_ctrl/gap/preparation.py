@@ -21,7 +21,6 @@ from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
 from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
-from avis_ctrl.gap.signals.converter import ConverterFinding
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.record_residual import RecordResidual
 from avis_ctrl.gap.signals.repair import repair
@@ -35,6 +34,7 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.measurement.campaign import Campaign, Record
+from avis_ctrl.measurement.gates.sample_clock import no_constant_delay
 from avis_ctrl.rigs.rig import Rig
 
 # Second-order terms by Newton-Euler, with sensors fixed to the payload and forces along the earth axes.
@@ -96,8 +96,9 @@ def prepare(
         estimated.
     """
     settings, progress = run.settings, run.progress
-    progress("converters; choice of the held-out records")
+    progress("converters and sample clocks; choice of the held-out records")
     converter = converter_faults(campaign, rig)
+    faults = SignalFaults(converter, drifting_delay=no_constant_delay(campaign))
     mended = repair(campaign, rig, None, converter) if campaign.y_unit == "V" and rig.acquisition else None
     campaign = mended.campaign if mended else campaign
     halves = divide(campaign)
@@ -119,7 +120,7 @@ def prepare(
             campaign = repair(clipped, rig, predicted(clipped, rough, run.each), converter).campaign
             halves = divide(campaign)
             rough = _rough(rough, halves, band, settings)
-    return _ready(campaign, nominal, rough, band, converter, clipped, run)
+    return _ready(campaign, nominal, rough, band, faults, clipped, run)
 
 
 def mended_with(prepared: Prepared, model: TableModel) -> Prepared:
@@ -127,8 +128,8 @@ def mended_with(prepared: Prepared, model: TableModel) -> Prepared:
     assert prepared.clipped is not None
     expected = predicted(prepared.clipped, model, prepared.run.each)
     campaign = repair(prepared.clipped, model.rig, expected, prepared.faults.converter).campaign
-    rough, converter, band = replace(prepared.rough, effects=()), prepared.faults.converter, prepared.band_Hz
-    return _ready(campaign, prepared.nominal, rough, band, converter, prepared.clipped, prepared.run)
+    rough, band = replace(prepared.rough, effects=()), prepared.band_Hz
+    return _ready(campaign, prepared.nominal, rough, band, prepared.faults, prepared.clipped, prepared.run)
 
 
 def with_noise_from(prepared: Prepared, model: TableModel) -> Prepared:
@@ -163,7 +164,7 @@ def _ready(
     nominal: TableModel,
     rough: TableModel,
     band: tuple[float, float],
-    converter: tuple[ConverterFinding, ...],
+    faults: SignalFaults,
     clipped: Campaign | None,
     run: Run,
 ) -> Prepared:
@@ -195,7 +196,7 @@ def _ready(
         how,
         replace(nominal, motion=motion),
         with_second_order(replace(rough, motion=motion)),
-        SignalFaults(converter, hum),
+        replace(faults, hum=hum),
         clipped,
         run,
     )

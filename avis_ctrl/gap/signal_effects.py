@@ -27,10 +27,12 @@ from avis_ctrl.rigs.rig import Rig
 
 @dataclass(frozen=True, eq=False)
 class SignalFaults:
-    """Faults found in the signals themselves."""
+    """Faults found in the signals themselves. drifting_delay : whether the delay of y after u changes too much within
+    the records for any model of the table (gate "sample clock")."""
 
     converter: tuple[ConverterFinding, ...] = ()
     hum: HumFinding | None = None
+    drifting_delay: bool = False
     noise: NoiseLevels | None = None
 
     @property

@@ -47,6 +47,7 @@ NAMED_HERE = (
     "periodicity",
     "spikes",
     "missing samples",
+    "sample clock",
 )
 
 

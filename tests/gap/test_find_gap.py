@@ -112,6 +112,15 @@ def test_a_gain_is_named_beside_a_flexible_mode():
 
 
 @pytest.mark.slow
+def test_records_with_two_clocks_give_no_name():
+    """The delay grows by 47 ms in every record; a constant delay of 20 ms explains half of it."""
+    case, found = found_in(seed=82036, clutter=True, duration_s=60.0)
+    assert [one.name for one in case.effects] == ["clock_rate_error"]
+    assert found.gap.verdict == "unexplained" and not found.gap.effects
+    assert any("gate sample clock" in one and "faster" in one for one in found.gap.sentences)
+
+
+@pytest.mark.slow
 def test_a_cable_that_tolerances_imitate_is_named():
     """Values of the rig file up to ten tolerances away leave 0.3 % of the response; starting values found there lead to
     a cable of a few newtons per metre at the wrong place, and to the verdict that nothing is missing."""

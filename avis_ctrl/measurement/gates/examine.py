@@ -14,9 +14,10 @@ from avis_ctrl.measurement.gates.excerpt import SETTINGS as EXCERPT
 from avis_ctrl.measurement.gates.excerpt import Gate, excerpt
 from avis_ctrl.measurement.gates.finding import Expectation, Finding
 from avis_ctrl.measurement.gates.hum import Hum
-from avis_ctrl.measurement.gates.missing_samples import MissingSamples
+from avis_ctrl.measurement.gates.missing_samples import MissingSamples, is_step
 from avis_ctrl.measurement.gates.periodicity import Periodicity
 from avis_ctrl.measurement.gates.repeatability import LEVEL_DEPENDENCE, Comparison
+from avis_ctrl.measurement.gates.sample_clock import SampleClock
 from avis_ctrl.measurement.gates.signal_quality import Coherence, SignalToNoise
 from avis_ctrl.measurement.gates.spikes import Spikes
 from avis_ctrl.measurement.gates.stepped_sine import SteppedSine
@@ -28,6 +29,7 @@ GATES: tuple[type[Gate], ...] = (
     ChannelMap,
     SteppedSine,
     MissingSamples,
+    SampleClock,
     Hum,
     SignalToNoise,
     Coherence,
@@ -35,7 +37,15 @@ GATES: tuple[type[Gate], ...] = (
     Comparison,
 )
 # Gates that missing or doubled samples of any record affect.
-CONSEQUENCES = (SignalToNoise.name, Coherence.name, Periodicity.name, Comparison.name, LEVEL_DEPENDENCE, Spikes.name)
+CONSEQUENCES = (
+    SampleClock.name,
+    SignalToNoise.name,
+    Coherence.name,
+    Periodicity.name,
+    Comparison.name,
+    LEVEL_DEPENDENCE,
+    Spikes.name,
+)
 # Gates that these affect only if every record has them.
 OF_ALL = (ORDER, POLARITY)
 
@@ -67,7 +77,8 @@ def examine(
         for gate, of in zip(gates, kept, strict=True):
             of.append(gate.look(seen))
     findings = [f for gate, of in zip(gates, kept, strict=True) for f in gate.conclude(of)]
-    findings = after_clipping(after_missing_samples(findings, {record.header.name for record in campaign.records}))
+    names = {record.header.name for record in campaign.records}
+    findings = after_clipping(after_missing_samples(after_clocks(findings), names))
     if shortened:
         said = (
             f" (Of record {', '.join(shortened[:4])}{' and others' if len(shortened) > 4 else ''} only pieces with "
@@ -75,6 +86,20 @@ def examine(
         )
         findings = [replace(f, sentence=f.sentence + said) for f in findings]
     return tuple(findings)
+
+
+def after_clocks(findings: list[Finding]) -> list[Finding]:
+    """Turn findings that follow from two clocks of different rates into notes that state this; lost samples, too: a
+    steady drift of the delay resembles a step."""
+    if not any(f.gate == SampleClock.name and f.severity == "stop" and not f.records for f in findings):
+        return findings
+    said = " This is likely a consequence of the different clocks of u and y."
+    return [
+        replace(f, severity="note", sentence=f.sentence + said)
+        if f.severity in ("warning", "stop") and (f.gate in CONSEQUENCES or is_step(f)) and f.gate != SampleClock.name
+        else f
+        for f in findings
+    ]
 
 
 def after_missing_samples(findings: list[Finding], names: Set[str]) -> list[Finding]:

@@ -157,6 +157,11 @@ class MissingSamples(Gate):
         return found[:3]
 
 
+def is_step(finding: Finding) -> bool:
+    """Whether a finding reports a step of the delay."""
+    return finding.gate == MissingSamples.name and finding.limit == SETTINGS.jump_samples
+
+
 def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     """t (K,) s of the segments' centres, and delay (up to 3, K) in samples of y behind H1 u, with H1 from all segments,
     the first half and the second half.
