@@ -184,6 +184,8 @@ def main() -> None:
         if not (hasattr(error, "exit_code") and hasattr(error, "format_message")):
             raise
         if message := error.format_message():  # empty without a command: the help was printed
+            if sys.argv[1:2] == ["gap"] and "--design" in sys.argv and "extra argument" in message:
+                message += " --design takes no file; a design file is given by --design-file."
             print(f"avis: {message}", file=sys.stderr)
         sys.exit(error.exit_code)
     _no_more_alarms()

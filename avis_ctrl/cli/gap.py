@@ -92,7 +92,11 @@ def gap(
             folder, found.gap, *rendered(document(found)), found.to_json(), found.design.files if found.design else None
         )
     _summary(terminal, found)
-    terminal.files(files, folder, *GAP_REPORTS)
+    then = ""
+    if found.design is not None and found.design.files:
+        made = folder / DESIGN_FOLDER
+        then = f"; next: avis design {made / 'design.toml'} --out {made / 'controller'}, then avis export"
+    terminal.files(files, folder, *GAP_REPORTS, then)
 
 
 def _summary(terminal: Terminal, found: GapFinding) -> None:

@@ -202,7 +202,7 @@ def design(
 
 def _numbers(text: str, count: int, field: str) -> tuple[float, ...]:
     try:
-        values = tuple(float(word) for word in text.replace(",", " ").split())
+        values = tuple(float(word) for word in text.replace(",", " ").replace("x", " ").split())
     except ValueError:
         values = ()
     if len(values) != count:

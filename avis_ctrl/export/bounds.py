@@ -167,9 +167,10 @@ class Bounds:
     mu : robust performance of the weighted channels. peak, band : worst-case transmissibility (largest singular value)
     up to half the sample rate and in the design's band.
     all_times : worst-case r.m.s. gain from the floor velocity up to half the sample rate to the payload velocity at all
-    times, also between the samples. above : the same from the floor velocity above half the rate, which the samples
-    show at other frequencies. Both are inf if not proved.
-    gain_above : largest loop gain at and above half the sample rate; the proof of stability requires less than 1.
+    times, also between the samples. above : the same from the floor velocity between half the rate and 8.5 times the
+    rate, which the samples show at other frequencies. Both are inf if not proved.
+    gain_above : largest bound of the loop gain at `CoverSettings.intervals` frequencies from half the sample rate to
+    `beyond` times this frequency; the proof of stability requires less than 1 from half the rate on.
     """
 
     mu: MuPeak
@@ -189,8 +190,8 @@ class StabilityNotProvedError(ComputationError):
 
 
 def gain_above_in_words(gain: float) -> str:
-    """The bound of the loop gain above half the sample rate, for a message."""
-    return f"the loop gain from half the sample rate on is bounded by {gain:.3g} only"
+    """The largest bound of the loop gain from half the sample rate on, for a message."""
+    return f"the bound of the loop gain from half the sample rate on is {gain:.3g}"
 
 
 def bounds(axes: SampledAxes, only_stable: bool = False, settings: CoverSettings = CoverSettings()) -> Bounds:
@@ -283,7 +284,8 @@ def _controller_error(
 
 
 def _gain_above(axes: SampledAxes, errors: Errors, settings: CoverSettings) -> float:
-    """Bound of the loop gain from half the sample rate on, both errors included."""
+    """Largest bound of the loop gain, both errors included, at `intervals` frequencies from half the sample rate on. It
+    is not proved between and beyond them (docs/export.md)."""
     omega = np.geomspace(1.0, settings.beyond, settings.intervals) * axes.half_rate
     size = _emitted_gain(errors.K, errors.least, errors.W_a, omega)
     table = axes.force_to_seen(omega)

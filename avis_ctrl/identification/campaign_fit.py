@@ -259,7 +259,8 @@ def weighted(
     try:
         found = measured_noise(blocks, campaign, band_Hz)
     except AvisError as error:
-        said = f"no measured noise covariance ({error}); the first fit gives all lines equal weight"
+        why = error.expected if isinstance(error, InputError) else str(error)
+        said = f"the records show no noise covariance ({why}); the first fit gives all lines equal weight"
         return relative_noise(blocks), said, False
     said = f"noise covariance estimated with a local polynomial model, {found[0].dof:.0f} degrees of freedom per line"
     return found, said, True

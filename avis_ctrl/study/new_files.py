@@ -83,15 +83,16 @@ def rig_text(new: NewRig) -> str:
     c = [2 * new.damping * np.sqrt(own * stiffness) for stiffness in k]
     places = _places(new)
     text = (
-        f'# {new.name}: a first rig file. Lines marked "assumed" follow from a homogeneous box on equal mounts:\n'
-        "# replace them by your own numbers. docs/rig_file.md explains every key; avis identify measures most.\n"
+        f'# {new.name}: a first rig file. Values marked "assumed" are usual ones, or those of a homogeneous box on\n'
+        "# equal mounts: replace them by your own numbers. docs/rig_file.md explains every key. avis identify\n"
+        "# measures most of them.\n"
         f'name = "{new.name}"\n\n[payload]\nmass_kg = {new.mass_kg:g}\n'
         f"inertia_kgm2 = {_row(inertia)}             # assumed: homogeneous box, about the centre of mass\n"
         "centre_of_mass_m = [0.0, 0.0, 0.0]   # assumed: in the geometric centre\n"
     )
     for place in places:
         text += (
-            f"\n[[isolator]]\nposition_m = {_row(place)}\n"
+            f"\n[[isolator]]\nposition_m = {_row(place)}      # assumed: 10 % of the size inside\n"
             f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
             f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n"
         )
@@ -100,14 +101,14 @@ def rig_text(new: NewRig) -> str:
         for letter, direction in (("z", (0, 0, 1)), axis):
             text += (
                 f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
-                f"direction = {_row(direction)}\nconstant_N_per_V = {new.constant_N_per_V:g}\n"
+                f"direction = {_row(direction)}      # assumed\nconstant_N_per_V = {new.constant_N_per_V:g}\n"
             )
     sensor = _ACCELEROMETER if new.sensors == "accelerometer" else _geophone(new.geophone)
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
         for letter, direction in (("z", (0, 0, 1)), axis):
             text += (
                 f'\n[[{new.sensors}]]\nname = "S{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
-                f"direction = {_row(direction)}\n{sensor}"
+                f"direction = {_row(direction)}      # assumed\n{sensor}"
             )
     return text + (
         f"\n[acquisition]\nsample_rate_Hz = {new.sample_rate_Hz:g}\nadc_bits = 16                        # assumed\n"
@@ -175,9 +176,10 @@ def _geophone(path: Path | None) -> str:
             raise InputError(f"the file contradicts itself: {'; '.join(wrong)}", file=path)
         source, gain, corner, damping = f"from {entry.file}", entry.gain_Vs_per_m, entry.corner_Hz, entry.damping
     return (
-        f"sensitivity_Vs_per_m = {gain:.6g}          # {source}\nsuspension_Hz = {corner:.6g}\n"
-        f"suspension_damping = {damping:.6g}\ncompensated_Hz = {min(0.5, corner):g}   # assumed: by "
-        "an analogue filter\ncompensated_damping = 0.7\npreamplifier_gain = 100.0            # assumed\n"
+        f"sensitivity_Vs_per_m = {gain:.6g}          # {source}\nsuspension_Hz = {corner:.6g}      # {source}\n"
+        f"suspension_damping = {damping:.6g}      # {source}\ncompensated_Hz = {min(0.5, corner):g}   # assumed: by "
+        "an analogue filter\ncompensated_damping = 0.7            # assumed\n"
+        "preamplifier_gain = 100.0            # assumed\n"
     )
 
 

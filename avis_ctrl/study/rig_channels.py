@@ -71,6 +71,8 @@ def with_rig_names(
     if measured.rig == UNNAMED:
         measured = replace(measured, rig=rig.name)
         notes.append(f"the file does not name its rig; assumed to be {rig.name}")
+    elif measured.rig != rig.name:
+        notes.append(f"the records are of the rig {measured.rig}, according to their file; the model is {rig.name}")
     renamed = {f"{role}_names": names for role, names in changes.items()}
     records = tuple(with_header(record, **renamed) for record in measured.records) if renamed else measured.records
     new = tuple(note for note in notes if note not in measured.notes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -416,3 +417,14 @@ def test_sensors_that_a_motion_makes_read_alike_are_no_copies():
         ("note", ("y1", "y3")),
         ("note", ("y2", "y3")),
     ]
+
+
+def test_measured_channels_that_repeat_exactly_are_commanded_voltages(clean):
+    """u and y exchanged in a file that does not state the period."""
+    records = []
+    for source in clean.records:
+        record = source.load()
+        header = replace(record.header, u_names=record.header.y_names, y_names=record.header.u_names, period_s=None)
+        records.append(replace(record, header=header, u=record.y, y=record.u))
+    found = [f for f in examine(replace(clean, records=tuple(records))) if f.gate == "missing samples"]
+    assert found[0].severity == "stop" and "u and y are exchanged" in found[0].sentence

@@ -45,6 +45,7 @@ def test_what_has_names_stays_as_it_is(rig):
     assert same.notes == (
         "the file has no column for the rig's drives Az1, Ax2, Az2, Ay3, Az3, Ax4",
         "the file has no column for the rig's sensors Sz1, Sx2, Sz2, Sy3",
+        "the records are of the rig another, according to their file; the model is avis",
     )
 
 

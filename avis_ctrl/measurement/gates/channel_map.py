@@ -167,6 +167,12 @@ def _right(faults: Faults, campaign: Campaign, comparison: ModelComparison, pict
             f"the others do. Its signal is more than {1000 * high:g} ms late or {-1000 * low:g} ms early, or the "
             "channel list is wrong, or the model lacks an effect there."
         )
+    elif alone:
+        severity = "note"
+        sentence = (
+            f"The model agrees with too few sensors to check the order of the channels ({least}). Check the channel "
+            "list by hand."
+        )
     else:
         sentence = f"No other order of the channels agrees better with the model ({least})."
     return Finding(ORDER, severity, sentence, channels, value=lowest, limit=enough, picture=picture)

@@ -20,6 +20,8 @@ from avis_ctrl.measurement.gates.h1 import H1, Samples, Spectra, h1
 class MissingSamplesSettings:
     """block_rows : rows of the shortest repeated block, equal in every channel: with noise in one channel this is no
         coincidence.
+    periodic : minimum fraction of a record's rows that equal earlier rows for the record to be periodic as a whole: two
+        periods give a half.
     jump_samples : minimum step of the delay: only whole samples are lost.
     longest_samples : maximum delay in the search, in either direction, and maximum step: segments without a clear delay
         scatter over the whole range of the search.
@@ -32,6 +34,7 @@ class MissingSamplesSettings:
     """
 
     block_rows: int = 16
+    periodic: float = 0.4
     jump_samples: float = 0.5
     longest_samples: int = 64
     explains: float = 0.1
@@ -116,6 +119,11 @@ class MissingSamples(Gate):
                 f"Record {name} repeats {n} rows at {at / rate:.5g} s that it already had {back} samples before: a "
                 "buffer was written twice. Repeat the record."
             )
+            if n > SETTINGS.periodic * len(seen.first.y):
+                sentence = (
+                    f"The measured channels of record {name} repeat exactly after {back} samples. No measured signal "
+                    "does: u and y are exchanged, or the records are simulated without noise and lack their period."
+                )
             yield Finding(self.name, "stop", sentence, (), (name,), n, SETTINGS.block_rows, picture)
         if clock.any():
             p = int(np.flatnonzero(clock)[0])

@@ -97,11 +97,12 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
 
 
 def _together(groups: Sequence[Sequence[str]]) -> Paragraph | None:
-    """Parameters that no record determines individually."""
+    """Parameters that the records determine only in combination."""
     told = "; ".join(joined(list(group)) for group in groups)
     text = (
-        f"No record can determine {told} individually, only in combination. Their individual values follow from the "
-        "combination and the rig file."
+        f"Records of the table as it is determine {told} only in combination. Their individual values follow from the "
+        "combination and the rig file. Records with mounts raised or moved would determine them; `avis identify` names "
+        "such records."
     )
     return Paragraph(text, "note") if groups else None
 
