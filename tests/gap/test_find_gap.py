@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from avis_ctrl.study.gap import GapOptions, find_gap
 from avis_ctrl.study.new_files import NewRig, rig_text
 from benchmarks.blind.lines import Answer, Named, parse
 
+ROOT = Path(__file__).parents[2]
 UNSTAGED = {"sensor_quantisation", "ground_motion"}  # they change the noise, not what a model explains
 
 
@@ -109,6 +111,13 @@ def test_a_gain_is_named_beside_a_flexible_mode():
     case, found = found_in(seed=81027, clutter=True, duration_s=60.0)
     assert {one.name for one in case.effects} == {"actuator_gain", "payload_flexible_mode"}
     assert {one.name: one.location for one in found.gap.effects} == {one.name: one.location for one in case.effects}
+
+
+@pytest.mark.slow
+def test_the_readme_quotes_this_search():
+    plan = tomllib.loads((ROOT / "designs" / "plans" / "lagging_amplifiers.toml").read_text())
+    gap = find_gap(ac.simulate_campaign("avis", plan, seed=1), load_rig("avis"), GapOptions()).gap
+    assert " ".join(gap.sentences[0].split()) in " ".join((ROOT / "README.md").read_text().split())
 
 
 @pytest.mark.slow
