@@ -168,36 +168,43 @@ def h1(of: list[Spectra]) -> H1 | None:
 
     Inputs that do not move have a zero column. Only lines that are driven in all excited directions are kept.
     """
-    U, Y = np.concatenate([s.U for s in of]), np.concatenate([s.Y for s in of])
+    U, Y = (
+        np.concatenate(several) if len(of) > 1 else several[0] for several in ([s.U for s in of], [s.Y for s in of])
+    )
     joint = Spectra(of[0].f, U, Y)
-    keep = joint.driven()
-    if not keep.any():
+    driven = joint.driven()
+    if not driven.any():
         return None
-    basis = directions(U[:, keep])
+    f, U, Y = joint.f[driven], joint.U[:, driven], joint.Y[:, driven]
+    basis = directions(U)
     K, rank = joint.count, basis.shape[1]
     if rank == 0 or 2 * rank + 4 > K:
         return None
-    reduced = U @ basis
-    gram = np.einsum("kfi,kfj->fij", reduced.conj(), reduced)
+    reduced, Y = np.moveaxis(U @ basis, 0, 1), np.moveaxis(Y, 0, 1)  # (n, K, rank), (n, K, n_y)
+    gram = np.swapaxes(reduced.conj(), 1, 2) @ reduced
     # Each direction is divided by its size in the whole band, so that a much louder drive does not hide the others.
-    size = np.sqrt(np.real(np.einsum("fii->i", gram[keep])))
+    size = np.sqrt(np.real(np.einsum("fii->i", gram)))
     power = np.linalg.eigvalsh(gram / np.outer(size, size))
-    keep &= power[:, 0] > SETTINGS.at_line * power[:, -1]
+    keep = power[:, 0] > SETTINGS.at_line * power[:, -1]
     if not keep.any():
         return None
-    reduced, Y, gram = reduced[:, keep], Y[:, keep], gram[keep]
+    f, reduced, Y, gram = f[keep], reduced[keep], Y[keep], gram[keep]
     inverse = np.linalg.inv(gram)
-    solved = inverse @ np.einsum("kfi,kfj->fij", reduced.conj(), Y)
-    residual = Y - np.einsum("kfi,fij->kfj", reduced, solved)
+    solved = inverse @ (np.swapaxes(reduced.conj(), 1, 2) @ Y)
+    left, total = _power(Y - reduced @ solved), _power(Y)
     dof = K - rank
-    noise = np.sum(np.abs(residual) ** 2, axis=0) / len(U) * K / dof
-    total = np.sum(np.abs(Y) ** 2, axis=0)
-    coherence = 1 - np.sum(np.abs(residual) ** 2, axis=0) / np.where(total > 0, total, 1.0)
+    noise = left / len(U) * K / dof
+    coherence = 1 - left / np.where(total > 0, total, 1.0)
     coherence[total == 0] = 0.0
     G = np.swapaxes(solved, 1, 2) @ basis.T
     covariance = basis @ inverse @ basis.T * (len(U) / K)
-    driven = np.sum(np.abs(reduced) ** 2, axis=(0, 2))
-    return H1(joint.f[keep], G, noise, covariance, np.clip(coherence, 0.0, 1.0), dof, basis, driven)
+    power_u = _power(reduced).sum(axis=1)
+    return H1(f, G, noise, covariance, np.clip(coherence, 0.0, 1.0), dof, basis, power_u)
+
+
+def _power(x: np.ndarray) -> np.ndarray:
+    """(n, channels) sum of |x|^2 over the segments, x (n, K, channels)."""
+    return np.asarray(np.sum(x.real**2 + x.imag**2, axis=1))
 
 
 def octaves(f: np.ndarray) -> list[np.ndarray]:

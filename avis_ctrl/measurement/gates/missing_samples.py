@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import stats
@@ -176,6 +177,16 @@ def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
 
     A step in the record corrupts the H1 of all segments, but at least one half is free of it.
     """
+    if seen not in _known:
+        _known[seen] = _delays_of(seen)
+    return _known[seen]
+
+
+# Two gates need the delays of a record.
+_known: WeakKeyDictionary[Excerpt, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+
+
+def _delays_of(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
     rate = seen.header.sample_rate_Hz
@@ -197,9 +208,9 @@ def _beginning(seen: Excerpt) -> Samples:
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
     """(K,) delay in samples of each segment of y behind H1 u."""
     keep = np.isin(of.f, estimate.f)
-    expected = np.einsum("fij,kfj->kfi", estimate.G, of.U[:, keep])
+    expected = np.moveaxis(np.moveaxis(of.U[:, keep], 0, 1) @ np.swapaxes(estimate.G, 1, 2), 0, 1)
     cross = of.Y[:, keep] * expected.conj() / np.maximum(estimate.noise, 1e-300)
-    weight = np.abs(expected) ** 2 / np.maximum(estimate.noise, 1e-300)
+    weight = (expected.real**2 + expected.imag**2) / np.maximum(estimate.noise, 1e-300)
     omega = 2 * np.pi * estimate.f[None, :, None] / rate
     # Gauss-Newton on sum weight |Y / expected - exp(-j omega d)|^2, initialised at the best whole number of samples.
     scan = np.arange(-SETTINGS.longest_samples, SETTINGS.longest_samples + 1)
