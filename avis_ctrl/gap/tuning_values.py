@@ -22,6 +22,7 @@ from avis_ctrl.gap.axis import settings as axis
 from avis_ctrl.gap.effects import base
 from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines
 from avis_ctrl.identification import campaign_fit
+from avis_ctrl.measurement.gates import sample_clock
 
 PARTS = (
     settings,
@@ -40,6 +41,7 @@ PARTS = (
     hum,
     noise_level,
     quiet_lines,
+    sample_clock,
     axis,
     campaign_fit,
 )

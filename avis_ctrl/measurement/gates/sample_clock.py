@@ -30,6 +30,7 @@ class SampleClockSettings:
         and thus with time.
     equal : maximum difference of a record's rate from the median rate, relative to the latter, for one pair of clocks
         to be the cause: samples that are lost again and again give every record a rate of its own.
+    segments : minimum number of segments of a record, for a straight line and its standard deviation.
     """
 
     seen_rad: float = 0.1
@@ -37,6 +38,7 @@ class SampleClockSettings:
     both_halves: float = 0.1
     showing: float = 0.5
     equal: float = 0.2
+    segments: int = 6
 
 
 SETTINGS = SampleClockSettings()
@@ -61,11 +63,11 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
     """Growth of the delay of y after u (`missing_samples.delays`): a straight line through the delays of the segments,
     tested by Student's t at `level`. None if the record cannot show it.
 
-    Of the three estimates of the delay the one with the median rate is used: with a large drift the response that is
-    averaged over the whole record is wrong, but not that of its halves.
+    Of the three estimates of the delay, the one with the median rate is used: a large drift falsifies the response that
+    is averaged over the whole record, but less those of its halves.
     """
     t, delay = delays(seen)
-    if len(t) < 6:
+    if len(t) < SETTINGS.segments:
         return None
     h, x = seen.header, t - t.mean()
     lines = _driven_in_both_halves(Samples(seen.first.u, seen.first.y, h.sample_rate_Hz))
