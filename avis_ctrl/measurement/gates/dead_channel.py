@@ -12,7 +12,7 @@ from avis_ctrl.measurement.campaign import RecordHeader
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, curves, quoted, samples_over_time
-from avis_ctrl.measurement.gates.h1 import h1, usable
+from avis_ctrl.measurement.gates.h1 import h1_of, usable
 from avis_ctrl.measurement.gates.sine_fit import fit_sine
 
 
@@ -143,8 +143,13 @@ def equal_runs(x: np.ndarray) -> list[tuple[int, int]]:
     """(length, start) of the two longest runs of equal samples."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(x)) + 1])
     lengths = np.diff(np.concatenate([starts, [len(x)]]))
-    order = np.argsort(lengths)[::-1][:2]
-    return [(int(lengths[k]), int(starts[k])) for k in order]
+    longest = int(np.argmax(lengths))
+    found = [(int(lengths[longest]), int(starts[longest]))]
+    if len(lengths) > 1:
+        lengths[longest] = 0
+        second = int(np.argmax(lengths))
+        found.append((int(lengths[second]), int(starts[second])))
+    return found
 
 
 def _excess(seen: Excerpt) -> np.ndarray | None:
@@ -154,7 +159,7 @@ def _excess(seen: Excerpt) -> np.ndarray | None:
     if seen.header.excitation == "sine":
         return _sine_excess(seen)
     samples = usable(seen)
-    if not samples.moving or (estimate := h1([samples.spectra()])) is None:
+    if not samples.moving or (estimate := h1_of(seen)) is None:
         return None
     limit = stats.beta.isf(FINDING.false_alarm / estimate.coherence.size, estimate.rank, estimate.dof)
     ratio = estimate.coherence / np.maximum(1 - estimate.coherence, 1e-12)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import wraps
+from typing import Any, ClassVar, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -74,6 +77,22 @@ def excerpt(record: RecordSource, longest: int = SETTINGS.longest) -> Excerpt:
     size = size // period * period
     starts = np.linspace(0, samples - size, SETTINGS.pieces).astype(int) // period * period
     return Excerpt(record.header, tuple(record.load(int(start), int(start) + size) for start in starts))
+
+
+Result = TypeVar("Result")
+
+
+def once(function: Callable[[Excerpt], Result]) -> Callable[[Excerpt], Result]:
+    """The function, computed once for each excerpt: several gates need the same result."""
+    known: WeakKeyDictionary[Excerpt, Result] = WeakKeyDictionary()
+
+    @wraps(function)
+    def of(seen: Excerpt) -> Result:
+        if seen not in known:
+            known[seen] = function(seen)
+        return known[seen]
+
+    return of
 
 
 class Gate(ABC):

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import signal
 
-from avis_ctrl.measurement.gates.excerpt import Excerpt
+from avis_ctrl.measurement.gates.excerpt import Excerpt, once
 
 # Independent segments per half-overlapping Hann segment: 1 / (1 + 2 rho^2), where rho = 1/6 is the correlation of the
 # window with itself shifted by half its length.
@@ -133,6 +133,7 @@ class Samples:
         return Spectra(np.fft.rfftfreq(size, 1 / self.rate_Hz), cut(self.u), cut(self.y))
 
 
+@once
 def usable(seen: Excerpt) -> Samples:
     """The mean period after the first, or the start of the record."""
     rate_Hz = seen.header.sample_rate_Hz
@@ -143,6 +144,18 @@ def usable(seen: Excerpt) -> Samples:
     # Copies: a view would keep the whole record in memory.
     u, y = (array[: SETTINGS.most_samples].copy() for array in (seen.first.u, seen.first.y))
     return Samples(u, y, rate_Hz)
+
+
+@once
+def spectra_of(seen: Excerpt) -> Spectra:
+    """Spectra of the usable samples."""
+    return usable(seen).spectra()
+
+
+@once
+def h1_of(seen: Excerpt) -> H1 | None:
+    """H1 over one record."""
+    return h1([spectra_of(seen)])
 
 
 def segment_length(samples: int, inputs: int) -> int:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from scipy import stats
 
 from avis_ctrl.measurement.campaign import RecordHeader
-from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
+from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate, once
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.measurement.gates.h1 import H1, Samples, Spectra, h1
@@ -171,26 +170,17 @@ def is_step(finding: Finding) -> bool:
     return finding.gate == MissingSamples.name and finding.limit == SETTINGS.jump_samples
 
 
+@once
 def delays(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     """t (K,) s of the segments' centres, and delay (up to 3, K) in samples of y behind H1 u, with H1 from all segments,
     the first half and the second half.
 
     A step in the record corrupts the H1 of all segments, but at least one half is free of it.
     """
-    if seen not in _known:
-        _known[seen] = _delays_of(seen)
-    return _known[seen]
-
-
-# Two gates need the delays of a record.
-_known: WeakKeyDictionary[Excerpt, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-
-
-def _delays_of(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
     if not seen.driven or seen.header.excitation == "sine":
         return np.zeros(0), np.zeros((1, 0))
     rate = seen.header.sample_rate_Hz
-    of = _beginning(seen).spectra()
+    of = spectra_from_beginning(seen)
     half = len(of.U) // 2
     parts = [of, Spectra(of.f, of.U[:half], of.Y[:half]), Spectra(of.f, of.U[half:], of.Y[half:])]
     estimates = [e for part in parts if (e := h1([part])) is not None]
@@ -203,6 +193,12 @@ def _delays_of(seen: Excerpt) -> tuple[np.ndarray, np.ndarray]:
 
 def _beginning(seen: Excerpt) -> Samples:
     return Samples(seen.first.u[: 1 << 17], seen.first.y[: 1 << 17], seen.header.sample_rate_Hz)
+
+
+@once
+def spectra_from_beginning(seen: Excerpt) -> Spectra:
+    """Spectra of successive segments, without averaging over periods."""
+    return _beginning(seen).spectra()
 
 
 def _delay(of: Spectra, estimate: H1, rate: float) -> np.ndarray:
@@ -232,7 +228,7 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     """
     rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
     samples = _beginning(seen)
-    y, of = samples.y, samples.spectra()
+    y, of = samples.y, spectra_from_beginning(seen)
     before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
     first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
     showing = of.f[np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second)]

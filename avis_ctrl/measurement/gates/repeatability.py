@@ -23,7 +23,7 @@ from avis_ctrl.measurement.gates.finding import (
     quoted,
     those,
 )
-from avis_ctrl.measurement.gates.h1 import Samples, Spectra, driven_lines, h1, octaves, usable
+from avis_ctrl.measurement.gates.h1 import Samples, Spectra, driven_lines, h1, octaves, spectra_of, usable
 from avis_ctrl.measurement.gates.periodicity import smoothed, windowed
 
 
@@ -107,7 +107,7 @@ class Comparison(Gate):
         if not seen.driven or h.excitation == "sine":
             return None
         mean = usable(seen)
-        kept = _Kept(h.name, h.excitation, h.level_V, mean.spectra())
+        kept = _Kept(h.name, h.excitation, h.level_V, spectra_of(seen))
         if not mean.wrap or (P := len(periods := seen.periods("y")[1:])) < 3:
             return kept
         variance = smoothed(np.sum(np.abs(windowed(periods - mean.y)) ** 2, axis=0) / (P - 1)) / P

@@ -12,8 +12,8 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate, excerpt
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series, Severity, quoted
-from avis_ctrl.measurement.gates.h1 import Samples
-from avis_ctrl.measurement.gates.missing_samples import delays
+from avis_ctrl.measurement.gates.h1 import Spectra
+from avis_ctrl.measurement.gates.missing_samples import delays, spectra_from_beginning
 
 # Variance of a slope through half-overlapping Hann segments over that through independent ones.
 OVERLAP = 1.5
@@ -70,7 +70,7 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
     if len(t) < SETTINGS.segments:
         return None
     h, x = seen.header, t - t.mean()
-    lines = _driven_in_both_halves(Samples(seen.first.u, seen.first.y, h.sample_rate_Hz))
+    lines = _driven_in_both_halves(spectra_from_beginning(seen))
     if lines is None:
         return None
     rates = delay @ x / (x @ x)
@@ -92,9 +92,8 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
     return Drift(h.name, h.duration_s, rate, abs(rate) * h.duration_s * omega, picture)
 
 
-def _driven_in_both_halves(samples: Samples) -> np.ndarray | None:
+def _driven_in_both_halves(of: Spectra) -> np.ndarray | None:
     """Frequencies [Hz] of the lines that are driven in both halves of a record; None if these are too few."""
-    of = samples.spectra()
     power, half = np.sum(np.abs(of.U) ** 2, axis=2), len(of.U) // 2
     first, second = power[:half].mean(axis=0), power[half:].mean(axis=0)
     driven = of.driven()

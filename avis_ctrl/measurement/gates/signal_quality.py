@@ -11,7 +11,18 @@ from scipy import stats
 from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Severity, bars, curves, over_frequency
-from avis_ctrl.measurement.gates.h1 import H1, Samples, centres, driven_lines, h1, octaves, thirds, usable
+from avis_ctrl.measurement.gates.h1 import (
+    H1,
+    Samples,
+    centres,
+    driven_lines,
+    h1,
+    h1_of,
+    octaves,
+    spectra_of,
+    thirds,
+    usable,
+)
 from avis_ctrl.measurement.gates.periodicity import smoothed
 
 
@@ -256,11 +267,10 @@ def _snr(seen: Excerpt) -> tuple[np.ndarray, np.ndarray | None, float]:
         signal = np.maximum(smoothed(np.abs(Y.mean(axis=0)[keep]) ** 2) - noise / P, 0.0)
         f = np.fft.rfftfreq(periods.shape[1], 1 / rate)[keep]
         return f, signal / np.maximum(noise, 1e-300), 0.0
-    of = usable(seen).spectra()
-    if (estimate := h1([of])) is None:
+    if (estimate := h1_of(seen)) is None:
         return np.zeros(0), None, 0.0
     free = np.maximum(estimate.unbiased_coherence(), 0.0)
-    return estimate.f, free / np.maximum(1 - free, 1e-12), 1 / float(of.f[1])
+    return estimate.f, free / np.maximum(1 - free, 1e-12), 1 / float(spectra_of(seen).f[1])
 
 
 def _high_noise(seen: Excerpt) -> np.ndarray | None:
