@@ -170,12 +170,14 @@ def _with_inputs(
     covariance: np.ndarray,
 ) -> Correlation:
     turn = np.exp(1j * np.outer(error.block.omega, tau))
+    # Lines and columns together as the last axis, for matrix products.
+    white = np.moveaxis(error.white, 1, 0).reshape(len(outputs), -1)
+    derivative = np.moveaxis(error.derivative, 2, 1).reshape(-1, white.shape[1])
     rows, values, limits = [], [], []
     for j in driven:
         u = error.block.U[:, j]
-        size = np.linalg.norm(u)
-        r = np.einsum("kim,km,kl->il", error.white, np.conj(u), turn, optimize=True) / size
-        g = np.einsum("pkim,km,kl->pil", error.derivative, np.conj(u), turn, optimize=True) / size
+        seen = (np.conj(u)[:, :, None] * turn[:, None]).reshape(-1, len(tau)) / np.linalg.norm(u)
+        r, g = white @ seen, (derivative @ seen).reshape(-1, len(outputs), len(tau))
         spread = 1 + np.real(np.einsum("pil,pq,qil->il", np.conj(g), covariance, g, optimize=True))
         root = np.sqrt(u.size)
         values.append(np.abs(r) / root)
