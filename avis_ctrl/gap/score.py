@@ -189,12 +189,22 @@ class Score:
     def of_effect(self, effect: ActiveEffect) -> np.ndarray:
         """(k, N): directions of the linear parameters of an effect at zero strength; without such parameters, the
         change of y by the whole effect."""
+        return self.of_effects([effect])[0]
+
+    def of_effects(self, effects: Sequence[ActiveEffect]) -> list[np.ndarray]:
+        """`of_effect` of several effects, with one projection for all."""
+        if not effects:
+            return []
+        changes = [self._changes(one) for one in effects]
+        joint = self.directions([np.concatenate(own) for own in zip(*changes, strict=True)])
+        return np.split(joint, np.cumsum([len(own[0]) for own in changes])[:-1])
+
+    def _changes(self, effect: ActiveEffect) -> list[np.ndarray]:
+        """(k, n, n_y, m) for each block: changes of y of `of_effect`."""
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
             added = self.model.with_effect(effect)
-            return self.directions(
-                [(added.answer(part.block, part.body, False).Y - part.response.Y)[None] for part in self.parts]
-            )
+            return [(added.answer(part.block, part.body, False).Y - part.response.Y)[None] for part in self.parts]
         models = []
         for j in linear:
             values = list(effect.values)
@@ -209,7 +219,7 @@ class Score:
                 side = part.side(model)
                 own.append((side.Y - rest + part.response.left @ side.push) / step)
             columns.append(np.array(own))
-        return self.directions(columns)
+        return columns
 
     def reduction(self, A: np.ndarray) -> Reduction:
         """Reduction of chi2 by directions (k, N)."""

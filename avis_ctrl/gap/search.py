@@ -58,14 +58,13 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], run: Run) 
         if effect.nonlinear and not model.motion:
             return []
         found = []
-        for place in effect.places(model):
-            if (effect.name, place.partition("/")[0]) not in taken:
-                best = seeds(effect, score, place)
-                starts = [
-                    active(effect, model, place, values)
-                    for values in dict.fromkeys(one.values for one in best[: run.settings.starts])
-                ]
-                found += [Candidate(starts[0], best[0].chi2, best[0].p_value, tuple(starts[1:]))] if best else []
+        places = [one for one in effect.places(model) if (effect.name, one.partition("/")[0]) not in taken]
+        for place, best in zip(places, seeds(effect, score, places) if places else (), strict=True):
+            starts = [
+                active(effect, model, place, values)
+                for values in dict.fromkeys(one.values for one in best[: run.settings.starts])
+            ]
+            found += [Candidate(starts[0], best[0].chi2, best[0].p_value, tuple(starts[1:]))] if best else []
         return found
 
     resonant = [one for one in effects if one.resonant]

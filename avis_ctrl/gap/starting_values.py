@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -134,32 +135,42 @@ class HasExtendedModels(Protocol):
         `one`."""
 
 
-def seeds(effect: Effect, score: Score, place: str) -> list[Seed]:
-    """Starting points of fits of an effect, the most promising first.
+def seeds(effect: Effect, score: Score, places: Sequence[str]) -> list[list[Seed]]:
+    """Starting points of fits of an effect at each place, the most promising first.
 
     By default, the score test is computed at every point of `Effect.starts`; it gives the linear parameters, limited to
     their physical bounds.
     """
     if isinstance(effect, FindsItsStart):
-        return effect.seeds(score, place)
-    parameters, found = effect.parameters(score.model, place), []
-    linear = [j for j, one in enumerate(parameters) if one.linear]
-    starts = effect.starts(score.model, place)
-    for point in starts:
-        begun = ActiveEffect(effect, place, parameters, tuple(float(v) for v in point))
-        A = score.of_effect(begun)
+        return [effect.seeds(score, place) for place in places]
+    begun = [
+        [
+            ActiveEffect(effect, place, effect.parameters(score.model, place), tuple(float(v) for v in point))
+            for point in effect.starts(score.model, place)
+        ]
+        for place in places
+    ]
+    directions = iter(score.of_effects([one for own in begun for one in own]))
+    return [_ranked(score, [(one, next(directions)) for one in own]) for own in begun]
+
+
+def _ranked(score: Score, begun: Sequence[tuple[ActiveEffect, np.ndarray]]) -> list[Seed]:
+    """Seeds from the starting points of an effect at one place with their directions, the most promising first."""
+    found = []
+    for one, A in begun:
+        linear = [j for j, parameter in enumerate(one.parameters) if parameter.linear]
         if not linear:
             # The effect acts at full strength or not at all.
             reduction = float(2 * A[0] @ score.e - A[0] @ A[0])
             if reduction > 0:
-                found.append(Seed(begun.values, reduction, len(parameters), len(starts)))
+                found.append(Seed(one.values, reduction, len(one.parameters), len(begun)))
             continue
         took = score.reduction(A)
-        values = list(begun.values)
+        values = list(one.values)
         for c, j in zip(took.coefficients, linear, strict=False):
-            one = parameters[j]
-            values[j] = float(np.clip(one.none + c, one.low, one.high))
-        wrong = any(values[j] == parameters[j].none for j in linear) and len(linear) == 1
+            parameter = one.parameters[j]
+            values[j] = float(np.clip(parameter.none + c, parameter.low, parameter.high))
+        wrong = any(values[j] == one.parameters[j].none for j in linear) and len(linear) == 1
         if not wrong:
-            found.append(Seed(tuple(values), took.chi2, took.rank, len(starts)))
+            found.append(Seed(tuple(values), took.chi2, took.rank, len(begun)))
     return sorted(found, key=lambda seed: -seed.chi2)

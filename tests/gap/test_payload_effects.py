@@ -336,7 +336,7 @@ def block_of(truth, noise=1e-4):
 def seeds_of(truth, name, place, noise=1e-4):
     """What the score makes of a weak effect."""
     score = Score(FREE, [block_of(truth, noise)])
-    return score, seeds(library()[name], score, place)
+    return score, seeds(library()[name], score, [place])[0]
 
 
 def test_seed_of_a_sprung_mass_along_any_direction():

@@ -102,7 +102,7 @@ def test_what_re_identification_absorbs_is_never_significant():
         took = score.reduction(score.of_effect(effect(name, place, None, free)))
         assert took.chi2 < 1e-6 * score.chi2
         assert took.rank == 0
-    assert all(seed.p_value > CHANCE for seed in seeds(library()["sensor_gain"], score, "Sz2"))
+    assert all(seed.p_value > CHANCE for seed in seeds(library()["sensor_gain"], score, ["Sz2"])[0])
 
 
 def test_parameter_errors_alone_are_found_by_no_effect():
@@ -116,8 +116,8 @@ def test_parameter_errors_alone_are_found_by_no_effect():
         seed.p_value
         for one in library().values()
         if not one.nonlinear
-        for place in one.places(fitted)
-        for seed in seeds(one, score, place)
+        for at_place in seeds(one, score, one.places(fitted))
+        for seed in at_place
     ]
     assert len(found) > 10
     assert min(found) > CHANCE
