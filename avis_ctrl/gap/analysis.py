@@ -219,13 +219,10 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
     best, probability, rivals, refused = fits.best, {}, {}, {}
     for step in fits.steps:
         probability[step.label], rivals[step.label] = probability_of(step, settings)
+    drift = "the delay of y after u drifts in the records (gate sample clock)" * prepared.faults.drifting_delay
     for step in fits.steps:
         label = step.label
-        why = (
-            "the delay of y after u drifts in the records (gate sample clock)"
-            if prepared.faults.drifting_delay
-            else _refusal(fits.best, step, probability[label], data, held, settings)
-        )
+        why = drift or _refusal(fits.best, step, probability[label], data, held, settings)
         if why:
             one = fits.best.model.effect(label)
             refused[label] = (

@@ -59,7 +59,7 @@ def candidates(fitted: Fitted, data: Data, effects: Sequence[Effect], run: Run) 
             return []
         found = []
         places = [one for one in effect.places(model) if (effect.name, one.partition("/")[0]) not in taken]
-        for place, best in zip(places, seeds(effect, score, places) if places else (), strict=True):
+        for place, best in zip(places, seeds(effect, score, places), strict=True):
             starts = [
                 active(effect, model, place, values)
                 for values in dict.fromkeys(one.values for one in best[: run.settings.starts])

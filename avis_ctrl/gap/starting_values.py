@@ -143,13 +143,10 @@ def seeds(effect: Effect, score: Score, places: Sequence[str]) -> list[list[Seed
     """
     if isinstance(effect, FindsItsStart):
         return [effect.seeds(score, place) for place in places]
-    begun = [
-        [
-            ActiveEffect(effect, place, effect.parameters(score.model, place), tuple(float(v) for v in point))
-            for point in effect.starts(score.model, place)
-        ]
-        for place in places
-    ]
+    begun = []
+    for place in places:
+        parameters, starts = effect.parameters(score.model, place), effect.starts(score.model, place)
+        begun.append([ActiveEffect(effect, place, parameters, tuple(float(v) for v in point)) for point in starts])
     directions = iter(score.of_effects([one for own in begun for one in own]))
     return [_ranked(score, [(one, next(directions)) for one in own]) for own in begun]
 

@@ -92,7 +92,7 @@ def rig_text(new: NewRig) -> str:
     )
     for place in places:
         text += (
-            f"\n[[isolator]]\nposition_m = {_row(place)}      # assumed: 10 % of the size inside\n"
+            f"\n[[isolator]]\nposition_m = {_row(place)}      # assumed: 10 % of the size from the edge\n"
             f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
             f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n"
         )

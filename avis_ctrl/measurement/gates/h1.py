@@ -181,10 +181,9 @@ def h1(of: list[Spectra]) -> H1 | None:
 
     Inputs that do not move have a zero column. Only lines that are driven in all excited directions are kept.
     """
-    U, Y = (
-        np.concatenate(several) if len(of) > 1 else several[0] for several in ([s.U for s in of], [s.Y for s in of])
-    )
-    joint = Spectra(of[0].f, U, Y)
+    joint = of[0]
+    if len(of) > 1:
+        joint = Spectra(joint.f, np.concatenate([s.U for s in of]), np.concatenate([s.Y for s in of]))
     driven = joint.driven()
     if not driven.any():
         return None

@@ -31,6 +31,7 @@ class MissingSamplesSettings:
         the line to show the step: on one side alone it cannot be distinguished from the phase of the response.
     showing : minimum fraction of all lines that must show a step. A swept sine drives each line once: only the few
         lines around the instant are driven on both sides, and each of them only for a moment.
+    overlap : variance of a mean or a slope over half-overlapping Hann segments, relative to independent ones.
     """
 
     block_rows: int = 16
@@ -40,6 +41,7 @@ class MissingSamplesSettings:
     explains: float = 0.1
     both_sides: float = 0.1
     showing: float = 0.5
+    overlap: float = 1.5
 
 
 SETTINGS = MissingSamplesSettings()
@@ -229,9 +231,7 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     rate, count = seen.header.sample_rate_Hz, max(1, round(abs(size)))
     samples = _beginning(seen)
     y, of = samples.y, spectra_from_beginning(seen)
-    before, power = h1([of]), np.sum(np.abs(of.U) ** 2, axis=2)
-    first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
-    showing = of.f[np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second)]
+    before, showing = h1([of]), of.f[driven_on_both_sides(of, where)]
     most = -np.inf
     for instant in t[max(0, where - 1) : where + 2] - seen.first.header.start_s:
         at = min(max(round(instant * rate), 0), len(y) - count - 1)
@@ -248,6 +248,14 @@ def explained(seen: Excerpt, t: np.ndarray, where: int, size: float) -> float:
     return most
 
 
+def driven_on_both_sides(of: Spectra, where: int) -> np.ndarray:
+    """(n,) mask of the lines with similar drive power before and after segment `where` (`both_sides` of the
+    settings)."""
+    power = np.sum(np.abs(of.U) ** 2, axis=2)
+    first, second = power[:where].mean(axis=0), power[where:].mean(axis=0)
+    return np.asarray(np.minimum(first, second) > SETTINGS.both_sides * np.maximum(first, second))
+
+
 def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
     """(index, size in samples) of the most significant step of the delay; None if no step is significant."""
     n = len(delay)
@@ -258,8 +266,8 @@ def delay_step(delay: np.ndarray, level: float) -> tuple[int, float] | None:
         size = float(np.median(b) - np.median(a))
         scatter = 1.4826 * np.concatenate([np.abs(a - np.median(a)), np.abs(b - np.median(b))])
         sigma = max(float(np.median(scatter)), 1e-6)
-        # 1.57: variance of a median over that of a mean; 1.5: half-overlapping segments are not quite independent.
-        t = abs(size) / (sigma * np.sqrt(1.57 * 1.5 * (1 / len(a) + 1 / len(b))))
+        # 1.57: variance of a median over that of a mean.
+        t = abs(size) / (sigma * np.sqrt(1.57 * SETTINGS.overlap * (1 / len(a) + 1 / len(b))))
         if best is None or t > best[0]:
             best = float(t), k, size
     if best is None or 2 * stats.t.sf(best[0], max(n // 2 - 2, 2)) > level:

@@ -13,10 +13,8 @@ from avis_ctrl.measurement.gates.excerpt import Excerpt, Gate, excerpt
 from avis_ctrl.measurement.gates.finding import SETTINGS as FINDING
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series, Severity, quoted
 from avis_ctrl.measurement.gates.h1 import Spectra
-from avis_ctrl.measurement.gates.missing_samples import delays, spectra_from_beginning
-
-# Variance of a slope through half-overlapping Hann segments over that through independent ones.
-OVERLAP = 1.5
+from avis_ctrl.measurement.gates.missing_samples import SETTINGS as STEPS
+from avis_ctrl.measurement.gates.missing_samples import delays, driven_on_both_sides, spectra_from_beginning
 
 
 @dataclass(frozen=True)
@@ -24,19 +22,13 @@ class SampleClockSettings:
     """seen_rad : phase error at the highest driven frequency, at the end of the record, above which the gate warns:
         10 % of the response there.
     wrong_rad : phase error above which the model of a constant delay fails, and the gate reports a stop.
-    both_halves : minimum ratio of a line's drive powers in the two halves of a record, the smaller to the larger, for
-        the line to show a drift.
-    showing : minimum fraction of the driven lines that must do so: in a swept sine the delay changes with frequency,
-        and thus with time.
     equal : maximum difference of a record's rate from the median rate, relative to the latter, for one pair of clocks
-        to be the cause: samples that are lost again and again give every record a rate of its own.
+        to be the cause: samples that are lost repeatedly give every record a rate of its own.
     segments : minimum number of segments of a record, for a straight line and its standard deviation.
     """
 
     seen_rad: float = 0.1
     wrong_rad: float = 1.0
-    both_halves: float = 0.1
-    showing: float = 0.5
     equal: float = 0.2
     segments: int = 6
 
@@ -63,8 +55,8 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
     """Growth of the delay of y after u (`missing_samples.delays`): a straight line through the delays of the segments,
     tested by Student's t at `level`. None if the record cannot show it.
 
-    Of the three estimates of the delay, the one with the median rate is used: a large drift falsifies the response that
-    is averaged over the whole record, but less those of its halves.
+    Of the three estimates of the delay, the one with the median rate is used: a large drift distorts the response that
+    is averaged over the whole record more than those of its halves.
     """
     t, delay = delays(seen)
     if len(t) < SETTINGS.segments:
@@ -76,7 +68,7 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
     rates = delay @ x / (x @ x)
     middle = int(np.argsort(rates)[len(rates) // 2])
     left = delay[middle] - delay[middle].mean() - rates[middle] * x
-    dof = len(t) / OVERLAP - 2
+    dof = len(t) / STEPS.overlap - 2
     std = np.sqrt(max(float(left @ left), 1e-300) / dof / (x @ x))
     significant = 2 * stats.t.sf(abs(rates[middle]) / std, dof) < level
     rate = float(rates[middle]) / h.sample_rate_Hz if significant else 0.0
@@ -93,12 +85,11 @@ def drift_of(seen: Excerpt, level: float = FINDING.false_alarm) -> Drift | None:
 
 
 def _driven_in_both_halves(of: Spectra) -> np.ndarray | None:
-    """Frequencies [Hz] of the lines that are driven in both halves of a record; None if these are too few."""
-    power, half = np.sum(np.abs(of.U) ** 2, axis=2), len(of.U) // 2
-    first, second = power[:half].mean(axis=0), power[half:].mean(axis=0)
+    """Frequencies [Hz] of the lines that are driven in both halves of a record; None if these are too few: in a swept
+    sine the delay changes with frequency, and thus with time."""
     driven = of.driven()
-    both = driven & (np.minimum(first, second) > SETTINGS.both_halves * np.maximum(first, second))
-    return of.f[both] if both.any() and both.sum() > SETTINGS.showing * driven.sum() else None
+    both = driven & driven_on_both_sides(of, len(of.U) // 2)
+    return of.f[both] if both.any() and both.sum() > STEPS.showing * driven.sum() else None
 
 
 def of_clocks(drifts: Sequence[Drift]) -> bool:
@@ -117,7 +108,7 @@ def cause(drifts: Sequence[Drift]) -> str:
     middle = float(np.median(rates))
     said = (
         f"In record {worst.record} the delay of the measured channels after the commanded voltage "
-        f"{'grows' if growth > 0 else 'falls'} by {1e3 * abs(growth):.3g} ms"
+        f"{'grows' if growth > 0 else 'decreases'} by {1e3 * abs(growth):.3g} ms"
     )
     if of_clocks(drifts):
         return (
@@ -128,10 +119,7 @@ def cause(drifts: Sequence[Drift]) -> str:
     others = [one.record for one in found if one is not worst]
     also = f", at another rate than in {quoted(others)}" if others else ", and not in the others"
     lost = "doubled" if middle > 0 else "lost"
-    return (
-        f"{said}{also}: samples are {lost} again and again, or the clocks of u and y are not locked. Repeat the "
-        "records."
-    )
+    return f"{said}{also}: samples are {lost} repeatedly, or the clocks of u and y are not locked. Repeat the records."
 
 
 def no_constant_delay(campaign: Campaign) -> bool:
