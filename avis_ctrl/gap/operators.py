@@ -64,6 +64,13 @@ class MountGeometry:
         """Mask of the rows along an axis."""
         return np.array([name.endswith("." + axis) for name in self.names])
 
+    def resonances(self, M: np.ndarray) -> np.ndarray:
+        """(n_g,) rad/s: Rayleigh's quotient of the motion that a force along each row gives a free payload of mass
+        matrix M (6, 6)."""
+        moved = np.linalg.solve(M, self.payload.T)
+        K = self.payload.T @ (self.stiffness[:, None] * self.payload) + self.rest_K
+        return np.asarray(np.sqrt(np.sum(moved * (K @ moved), axis=0) / np.sum(moved * self.payload.T, axis=0)))
+
 
 @dataclass(frozen=True, eq=False)
 class AddedCoordinate:

@@ -32,8 +32,8 @@ class NamedEffect:
     probability : of this effect among the candidates fitted in its place, given the data, with equal prior
         probabilities within the library; for an effect on the signals alone, the confidence of its detector.
         indistinguishable_from : names of effects that these data cannot distinguish from it.
-    share : increase of the held-out residual power without the effect, over the baseline's power in excess of the
-        noise.
+    share : increase of the held-out residual power with what the rig file states in place of the effect, over the
+        baseline's power in excess of the noise.
     label : of the active effect in the updated model; empty for an effect on the signals alone (hum, converter, ground
         motion). confirmation : a sentence on how it was found.
     """

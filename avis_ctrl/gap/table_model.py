@@ -187,6 +187,14 @@ class TableModel(Table):
         """The model without one of its effects."""
         return replace(self, effects=tuple(one for one in self.effects if one.label != label))
 
+    def with_law_of_rig_file(self, label: str) -> TableModel:
+        """The model without one of its effects, but with the law that a rig file states in its place (`instead`)."""
+        one = self.effect(label)
+        place = one.effect.instead(one.place)
+        if not place:
+            return self.without(label)
+        return replace(self, effects=tuple(replace(e, place=place) if e is one else e for e in self.effects))
+
     @cached_property
     def effective(self) -> ResponseModel:
         """The base with the rig parameters that effects set."""

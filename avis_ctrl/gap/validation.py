@@ -34,9 +34,9 @@ class Power:
 
 
 def share_of(model: TableModel, label: str, blocks: Sequence[SpectralBlock], power: Power, with_it: float) -> float:
-    """Increase of the held-out residual power when one effect is removed without a new fit, over the baseline's excess.
-    with_it : the residual power of the whole model."""
-    return power.share(ModelResidual.of(model.without(label), blocks).nrmse ** 2 - with_it)
+    """Increase of the held-out residual power when one effect is replaced by what the rig file states, without a new
+    fit, over the baseline's excess. with_it : the residual power of the whole model."""
+    return power.share(ModelResidual.of(model.with_law_of_rig_file(label), blocks).nrmse ** 2 - with_it)
 
 
 @dataclass(frozen=True)

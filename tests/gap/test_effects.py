@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 
@@ -136,6 +137,31 @@ def test_structural_loss(eta):
     # Bode's relation: phase = pi/2 times the slope of the modulus on logarithmic axes
     slope = np.log(abs(causal[2] / causal[0])) / np.log(f[2] / f[0])
     assert np.angle(causal[1]) == pytest.approx(np.pi / 2 * slope, rel=1e-9)
+
+
+@pytest.mark.parametrize("place", ["isolators/causal", "isolators/complex"])
+def test_viscous_damping_in_place_of_structural_loss(place):
+    """A spring and a dashpot in every mount, which equal the law at the resonances of the suspension."""
+    M, K = RIG.equations_of_motion().M, Assembly(RIG).mounts().K
+    squares, modes = scipy.linalg.eigh(K, M)
+    mounts = BARE.operators(OMEGA).mounts
+    moved = (mounts.payload @ modes) ** 2  # of every mode by a force along each row
+    w = mounts.resonances(M)
+    np.testing.assert_allclose(w, np.sqrt(moved @ squares / moved.sum(axis=1)), rtol=1e-9)
+
+    model = with_effect("structural_damping", place, [0.1])
+    viscous = model.with_law_of_rig_file(model.labels[0])
+    law, instead = (one.operators(w).stiffness_factor for one in (model, viscous))
+    np.testing.assert_allclose(np.diagonal(instead), np.broadcast_to(law, instead.shape).diagonal(), rtol=1e-12)
+    at = 2 * np.pi * np.array([0.1, 10.0, 300.0])
+    factor = viscous.operators(at).stiffness_factor
+    np.testing.assert_allclose(factor.real, np.broadcast_to(factor.real[0], factor.shape), rtol=1e-12)
+    np.testing.assert_allclose(factor.imag / at[:, None], np.broadcast_to(factor.imag[0] / at[0], factor.shape))
+
+
+def test_other_effects_have_no_law_in_a_rig_file():
+    model = with_effect("mount_relaxation", "isolators z", [0.1, 1.0])
+    assert model.with_law_of_rig_file(model.labels[0]).effects == ()
 
 
 @pytest.mark.parametrize(

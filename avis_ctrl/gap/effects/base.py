@@ -232,6 +232,11 @@ class Effect(ABC):
         """Parameters of the effect at a place."""
         raise NotImplementedError
 
+    def instead(self, place: str) -> str:
+        """Place with the law that a rig file states in place of the effect's own, with the same values; empty if it
+        states none. With this law the share of an effect is computed."""
+        return ""
+
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:
         """Parameters of the rig that the effect sets."""
         return {}

@@ -18,6 +18,9 @@ from avis_ctrl.gap.score import Score, reduction, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.rigs.rig import Rig
 
+# Suffix of a place: viscous damping in place of a loss that is independent of frequency.
+VISCOUS = " viscous"
+
 
 def has_mounts(model: Table) -> bool:
     """Whether the rig has named stiffness and damping parameters of its mounts."""
@@ -67,7 +70,8 @@ class StructuralDamping(OfMounts):
     """Loss nearly independent of frequency in every mount.
 
     causal : k (s/w_ref)^a, loss factor tan(pi a/2) at every frequency, with the rise of stiffness that causality
-    requires. complex : k (1 + j eta), the textbook constant, which no passive element has at all frequencies.
+    requires. complex : k (1 + j eta), the textbook constant, which no passive element has at all frequencies. In their
+    place a rig file states viscous damping: k and c that are equal to each law at the suspension resonances.
     """
 
     name = "structural_damping"
@@ -78,13 +82,23 @@ class StructuralDamping(OfMounts):
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
 
+    def instead(self, place: str) -> str:
+        return place + VISCOUS
+
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        eta = values["loss_factor"]
-        if place.endswith("complex"):
-            factor = np.full(len(ops.s), 1 + 1j * eta)
+        law, eta = place.removesuffix(VISCOUS), values["loss_factor"]
+
+        def factor(s: np.ndarray) -> np.ndarray:
+            if law.endswith("complex"):
+                return np.full(len(s), 1 + 1j * eta)
+            return np.asarray((s / (2 * np.pi * LIBRARY.loss_Hz)) ** (2 / np.pi * np.arctan(eta)))
+
+        if place.endswith(VISCOUS):
+            w = ops.mounts.resonances(ops.base.matrices.M)
+            at_resonance = factor(1j * w)
+            ops.stiffness_factor = ops.stiffness_factor * (at_resonance.real + ops.s[:, None] / w * at_resonance.imag)
         else:
-            factor = (ops.s / (2 * np.pi * LIBRARY.loss_Hz)) ** (2 / np.pi * np.arctan(eta))
-        ops.stiffness_factor = ops.stiffness_factor * factor[:, None]
+            ops.stiffness_factor = ops.stiffness_factor * factor(ops.s)[:, None]
 
 
 @register

@@ -84,7 +84,8 @@ def named(gap: Gap | AxisGap, remark: str) -> Table:
     return listed(
         "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
         "held-out data without this effect, divided by the residual power beyond noise of the "
-        f"model without effects. Effects below 1 % are called traces.{remark}",
+        "model without effects. (In place of structural damping, the mounts then have viscous damping that is equal "
+        f"at the suspension resonances.) Effects below 1 % are called traces.{remark}",
         [*gap.effects, *gap.traces],
         {
             "effect": lambda one: f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",
