@@ -33,6 +33,7 @@ class ReportSettings:
         the worst, whose response is drawn in the report of a gap: their figures fill a page.
     held_out : maximum number of held-out records with figures of their own: a long record is split into many pieces.
     stage_letters : letters per row of a stage's name under its bar, so that four names fit side by side on a phone.
+    page_letters : letters of such names, in one row and side by side, that fit across a page.
     least_power : smallest fraction of the power that is drawn [1], -90 dB.
     map_lowest, map_top : lower end, and smallest upper end, of the colour scale of a map relative to the noise power
         [1]: noise alone is nearly white, and a residual little above it does not look large.
@@ -60,6 +61,7 @@ class ReportSettings:
     worst_outputs: int = 3
     held_out: int = 3
     stage_letters: int = 13
+    page_letters: int = 80
     least_power: float = 1e-9
     map_lowest: float = 0.5
     map_top: float = 10.0

@@ -71,7 +71,10 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
 def ladder(gap: Gap) -> Figure:
     """Error of each stage as a bar, and the error due to noise alone as a line."""
     values = np.array([100 * one.nrmse for one in gap.stages])
-    place, axis = places([textwrap.fill(rung(one.name, k), SETTINGS.stage_letters) for k, one in enumerate(gap.stages)])
+    letters = min(SETTINGS.stage_letters, SETTINGS.page_letters // len(gap.stages))
+    place, axis = places(
+        [textwrap.fill(rung(one.name, k), letters, break_long_words=False) for k, one in enumerate(gap.stages)]
+    )
     noise = 100 * gap.noise_nrmse
     low, high = log_limits(np.append(values, noise), 1 / 1.5, 1.6, (0.1, 100.0))
     limits = float(10 ** np.floor(np.log10(low))), high
@@ -124,8 +127,9 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
             "residual above."
         )
     if seen.simulated:
+        have = "has" if len(seen.simulated) == 1 else "have"
         text += (
-            f" {joined(list(map(wording.titled, seen.simulated))).capitalize()} has no frequency response. "
+            f" {joined(list(map(wording.titled, seen.simulated))).capitalize()} {have} no frequency response. "
             "That of the updated model is therefore estimated in the same way as the measured one, from a "
             "simulation of the same records."
         )

@@ -66,8 +66,8 @@ def in_numbers(gap: Gap) -> str:
 def _group(one: NamedEffect) -> str:
     names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
     return (
-        f"These records cannot distinguish {joined(names)}. Any of them may be the cause, and so may a "
-        "cause that was not among the candidates. See the section on what to measure next."
+        f"These records cannot distinguish {joined(names)}. {'Either' if len(names) == 2 else 'Any'} of them may be "
+        "the cause, and so may a cause that was not among the candidates. See the section on what to measure next."
     )
 
 
