@@ -100,7 +100,7 @@ SIMULATE_CAMPAIGN = Options("""
 --write-plan FILE: also write the plan used, as a starting point
 --truth FILE: also write the rig that was simulated, with its perturbed values
 --perturbed: default plan; stiffness, mass and inertia differ from the rig file by up to 5 %, damping by up to 20 %, and
-    values listed under [tolerances] within their standard deviations
+    values with a tolerance in the rig file by random amounts (normal, the tolerance is the standard deviation)
 --orthogonal: default plan with orthogonal multisines
 --duration: length of each record of the default plan in seconds
 --effects FILE.py: Python file with effects of your own that the plan names (docs/own_effect.md)

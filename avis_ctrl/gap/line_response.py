@@ -142,7 +142,7 @@ def line_response(model: TableModel, samples: int, sample_rate_Hz: float) -> Lin
 
 
 def clear_cache() -> None:
-    """Free the memory of the cached response, some 3 kB per sample of a record."""
+    """Free the memory of the cached response."""
     for _, response in _last:
         response.kept.clear()  # they refer to the response: only garbage collection would free it
     _last.clear()

@@ -304,7 +304,7 @@ class CampaignFit:
     """A fit to a campaign.
 
     fit : with the noise of its own residuals. first : with the noise measured without a model of the rig, if
-        `measured`; its chi-square per degree of freedom is then a rough figure (0.85 to 0.95 for a correct model,
+        `measured`; its chi-square per degree of freedom is then a rough figure (somewhat below 1 for a correct model,
         because local models take some of the response's curvature for noise), and meaningless otherwise. The held-out
         chi-square is the criterion.
     start : the model before the fit. notes : sentences.

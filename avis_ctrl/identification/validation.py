@@ -35,7 +35,7 @@ from avis_ctrl.summary import percent
 class ValidationSettings:
     """level : probability of the intervals of chi-square [1]: the usual one.
     repeats : r.m.s. of the residual, whitened by the noise of a local polynomial model [1], from which it is an error
-        of the model that repeats in the records. Of a correct model it is 0.9 to 1.1.
+        of the model that repeats in the records. Of a correct model it is about 1.
     """
 
     level: float = 0.95

@@ -30,8 +30,8 @@ from avis_ctrl.summary import joined
 class RecordPlausibility:
     """Criteria for records in a wrong unit; distances are mean decades of r.m.s., see `distance`.
 
-    far : records below this distance pass (tables with any parameter off by 30 % and hidden effects stay below half of
-        it).
+    far : records below this distance pass (tables with any parameter off by 30 % and hidden effects stay below 0.6
+        of it).
     fits, share : an error is named if its correction reduces the distance to at most `fits`, and to at most the
         fraction `share` of the previous distance.
     cap : maximum number of decades that one band contributes.

@@ -105,6 +105,7 @@ def test_slopes_are_derivatives():
 def test_grid_has_no_gaps():
     grid = Grid.of(1000.0, CoverSettings())
     low, high = grid.centre - grid.half, grid.centre + grid.half
+    assert grid.centre.size == 4248  # docs/export.md
     assert low[0] == 0.0
     assert high[-1] == pytest.approx(1000.0)
     assert np.allclose(high[:-1], low[1:], rtol=1e-9)
