@@ -299,7 +299,7 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         NamedEffect(
             one.effect.name,
             name_of(one.label)[1],
-            one.effect.title,
+            one.effect.titled(one.place),
             one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names)),
             names.probability[one.label],
             names.rivals[one.label],
@@ -462,7 +462,7 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
             rows.append(
                 Considered(
                     effect.effect.name,
-                    name_of(label)[1],
+                    effect.place,
                     chi2,
                     min(probability[label], settings.most_sure),
                     reason,
@@ -484,7 +484,7 @@ def _opening(
     before = next(one.nrmse for one in stages if one.name == "re-identified")
     rest = f"the noise alone is estimated at {percent(after.noise_nrmse)}"
     also = f" Effects that explain less than 1 % of the gap: {joined([one.name for one in traces])}." if traces else ""
-    fitted = "all values of the rig file fitted within their tolerances"
+    fitted = "all values of the rig file fitted again"
     if verdict == "none":
         return (
             f"No missing effect was found: with {fitted}, the error on held-out records is "
@@ -495,7 +495,7 @@ def _opening(
             f"The model misses something that no effect of the library explains: with {fitted}, the error on "
             f"held-out records is {percent(residual.nrmse)}; {rest}.{also}"
         )
-    lines = " on the lines without hum" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
+    lines = " (on lines without hum)" if any(one.name == "mains_hum" for one in (*reported, *traces)) else ""
     return (
         f"{missed(reported)} With {'this' if len(reported) == 1 else 'these'} and {fitted}, the gap falls from "
         f"{percent(before)} to {percent(residual.nrmse)}{lines}; {rest}.{also}"

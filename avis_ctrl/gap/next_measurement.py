@@ -41,7 +41,7 @@ SETTINGS = NextMeasurementSettings()
 def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
     """How to separate two explanations: measure where the predictions of their refitted models differ most."""
     for time_varying, quantity, advice in (
-        (False, "amplitude", "at half and at twice the level"),
+        (False, "amplitude", "at half of the lowest and at twice the highest level"),
         (True, "time", "over a longer time"),
     ):
         depends = [_depends(model, beside, time_varying) for model, beside in ((a, b), (b, a))]
@@ -49,7 +49,7 @@ def between(name: str, other: str, a: TableModel, b: TableModel) -> str:
             why = (
                 f"they depend on {quantity} in different ways"
                 if all(depends)
-                else (f"only one of them depends on {quantity}")
+                else f"only {name if depends[0] else other} depends on {quantity}"
             )
             return f"To distinguish {name} from {other}, record the same signals {advice}: {why}."
     frequency = np.geomspace(0.1, 0.4 / max(a.period_s, 1e-4), SETTINGS.points)

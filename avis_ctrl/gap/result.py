@@ -18,7 +18,10 @@ VERDICTS: tuple[str, ...] = get_args(Verdict)
 
 
 def spoken(name: str, unit: str) -> str:
-    """A parameter's name without its unit, which follows the number; of a rotation, "about" its axis."""
+    """A parameter's name without its unit, which follows the number; of a rotation, "about" its axis. The values of
+    mounts or drives that differ are fractions of their mean."""
+    if name.startswith("uneven_"):
+        return f"{name.removeprefix('uneven_')} above the mean"
     tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
     words = (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
     return re.sub(r"\br([xyz])$", r"about \1", words)
@@ -151,7 +154,8 @@ class Where:
 class Considered:
     """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named.
 
-    probability : odds against the best candidate of the same step, at most `GapSettings.most_sure`.
+    location : the place, with the law of the effect after a slash. probability : odds against the best candidate of
+        the same step, at most `GapSettings.most_sure`.
     """
 
     name: str

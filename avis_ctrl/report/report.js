@@ -19,12 +19,18 @@
     const entries = data.filter(t => t.showlegend).length;
     // The legend is below the graph, with one entry per row on a phone and about three elsewhere.
     const rows = layout.showlegend ? (phone ? entries : Math.ceil(entries / 3)) : 0;
-    const plot = layout.height - 110, foot = 58 + 20 * rows;
+    // Names of many stages under the x axis are turned on a phone and need room above the legend.
+    const named = Object.entries(axes).filter(([k, v]) => k[0] === "x" && v.ticktext);
+    const letters = Math.max(0, ...named.flatMap(([, v]) => v.ticktext.length < 5 ? [] : v.ticktext)
+      .flatMap(name => name.split("<br>").map(part => part.length)));
+    const turned = phone && letters > 6 ? 6.5 * letters - 14 : 0;
+    if (turned) named.forEach(([, v]) => { v.tickangle = -90; });
+    const plot = layout.height - 110, foot = 58 + turned + 20 * rows;
     Plotly.newPlot(frame, data, {
       ...layout, ...axes, height: plot + 26 + foot, paper_bgcolor: "#fff", plot_bgcolor: "#fff",
       font: { family: "system-ui, 'DejaVu Sans', sans-serif", size: phone ? 11 : 12.5, color: "#1d1d1f" },
       margin: { l: phone ? 52 : 68, r: 12, t: 26, b: foot },
-      legend: { orientation: "h", x: 0, xanchor: "left", y: -48 / plot, yanchor: "top", itemsizing: "constant" },
+      legend: { orientation: "h", x: 0, xanchor: "left", y: -(48 + turned) / plot, yanchor: "top", itemsizing: "constant" },
       hovermode: "closest", dragmode: phone ? false : "zoom",
     }, { responsive: true, displaylogo: false, displayModeBar: phone ? false : "hover",
       modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });

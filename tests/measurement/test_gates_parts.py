@@ -232,6 +232,19 @@ def test_hum_names_mains_channel_and_size(rng, mains, off):
     assert found[0].value == pytest.approx(P[middle - 1 : middle + 2].max() / floor)
 
 
+@pytest.mark.parametrize(("lines", "mains"), [((60, 120, 300), [60]), ((50, 300), [50]), ((300,), [50, 60])])
+def test_a_common_harmonic_is_hum_of_the_frequency_with_other_lines(rng, lines, mains):
+    """300 Hz is a harmonic of 50 Hz and of 60 Hz."""
+    record = rest(rng)
+    y = record.y.copy()
+    y[:, 2] += 0.4 * sum(np.sin(2 * np.pi * f * np.arange(len(y)) / 1000) for f in lines)
+    gate = Hum(Campaign("x", (Record(record.header, record.u, y),)), Expectation())
+    found = gate.conclude([gate.look(excerpt(Record(record.header, record.u, y)))])
+    assert len(found) == len(mains)
+    named = ", ".join(f"{f:g}" for f in lines)
+    assert all(f"carries mains hum at {named} Hz:" in one.sentence for one in found)
+
+
 @pytest.mark.parametrize("excitation", ["multisine", "noise"])
 def test_signal_to_noise_is_what_was_put_in(rng, excitation):
     """20 dB and 0 dB on every line, of six periods or of white noise, in each octave within what few lines scatter."""

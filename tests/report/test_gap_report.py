@@ -80,8 +80,10 @@ def test_each_verdict_has_its_words_and_colour(found, verdict):
             "unexplained": (False, False),
         }[verdict]
     )
-    claims = {name: sum(text in prose(own) for text in (claim,)) for name, claim in wording.CLAIMS.items()}
-    assert claims == {name: int(name == verdict) for name in VERDICTS}
+    left = one.gap.left
+    removed = words.percent(1 - left.share) if left else "a part"
+    claims = {name: claim.format(removed=removed) in prose(own) for name, claim in wording.CLAIMS.items()}
+    assert claims == {name: name == verdict for name in VERDICTS}
     assert f"Verdict: {verdict}." in prose(own)
     css = {(True, False): "verdict good", (None, True): "verdict half", (False, False): "verdict bad"}[look]
     classes = [a.get("class") for tag, a in page_of(one).elements if tag == "p"]
@@ -159,7 +161,7 @@ def test_a_quantity_in_words(one, text):
 
 
 def test_probabilities_are_never_certain():
-    assert wording.probability(1.0) == "> 99.9 %" and wording.probability(0.0) == "< 0.1 %"
+    assert wording.probability(1.0) == "≥ 99 %" and wording.probability(0.0) == "< 0.1 %"
     assert wording.probability(0.874) == "87.4 %"
 
 
@@ -326,7 +328,7 @@ def test_terms_that_every_model_holds_are_no_effect(found):
         ("k3_N_per_m3", "N/m^3", "k3"),
         ("mass_kg", "kg", "mass"),
         ("damping", "1", "damping"),
-        ("uneven_1", "1", "uneven 1"),
+        ("uneven_1", "1", "1 above the mean"),
         ("slope_per_h", "1/h", "slope"),
     ],
 )

@@ -257,9 +257,13 @@ class Effect(ABC):
         """(samples, n_y) acceleration along the sensors, added to that of the payload; None for none."""
         return None
 
+    def titled(self, place: str) -> str:
+        """The title of the effect with the law of a place."""
+        return self.title
+
     def described(self, place: str, values: Values) -> str:
         """Description with its place, for a sentence."""
-        return f"{self.title} ({place})"
+        return f"{self.titled(place)} ({place})"
 
     def spectra(self, record: RecordMotion, place: str, values: Values, omega: np.ndarray) -> Added:
         """Contribution to a record on lines omega; for a force proportional to `strength`, the unit force is cached."""

@@ -31,8 +31,12 @@ class PayloadFlexibleMode(Effect):
 
     name = "payload_flexible_mode"
     title = "a flexible mode of the payload"
-    looks_like = "a resonance above those of the suspension, with one mode shape for all drives and sensors"
+    looks_like = "resonances above those of the suspension, each with one mode shape for all drives and sensors"
     holds_states = True
+
+    def titled(self, place: str) -> str:
+        variant = place.partition("/")[2]
+        return f"{variant} flexible modes of the payload" if variant else self.title
 
     def places(self, model: Table) -> tuple[str, ...]:
         return ("payload", "payload/two", "payload/three") if shape_points(model) else ()
@@ -96,11 +100,13 @@ class PayloadFlexibleMode(Effect):
         return [(place, (*one.values, *found[0].values))] if place and found else []
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
-        """The modes in order of frequency."""
+        """The modes in order of frequency: first the frequencies of all, then the damping ratios, then the shapes."""
         found = list(super().reported(model, place, values, covariance).items())
         own = len(found) // COUNTS[place.partition("/")[2]]
         each = sorted((found[k : k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
-        return dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
+        ordered = dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
+        kinds = ("frequency", "damping", "shape")
+        return {name: ordered[name] for kind in kinds for name in ordered if name.startswith(kind)}
 
 
 def modes(values: Values) -> list[tuple[float, float, np.ndarray]]:

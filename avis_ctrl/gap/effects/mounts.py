@@ -75,7 +75,7 @@ class StructuralDamping(OfMounts):
     """
 
     name = "structural_damping"
-    title = "the mounts lose energy nearly independently of frequency, not in proportion to velocity"
+    title = "beside viscous damping, the mounts have a loss that hardly depends on frequency"
     looks_like = "more damping at low resonances and less at high ones than with dashpots"
     at = ("isolators/causal", "isolators/complex")
 
@@ -245,7 +245,7 @@ class CubicStiffness(OfMounts):
 
     name = "cubic_stiffness"
     title = "the mounts stiffen with amplitude"
-    looks_like = "vertical resonances rise with level, and third harmonics appear"
+    looks_like = "the frequencies of vertical resonances rise with the level, and third harmonics appear"
     at: tuple[str, ...] = ("isolators z", "isolators z/polynomial")
     nonlinear = True
 

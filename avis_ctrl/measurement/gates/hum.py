@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +93,7 @@ class Hum(Gate):
             for line in k.lines:
                 if line.p < FINDING.false_alarm / tested and line.ratio > SETTINGS.least_ratio:
                     hits.setdefault((line.channel, line.mains_Hz), []).append((k, line))
-        found = [self._finding(mains, some) for (_, mains), some in sorted(hits.items())]
+        found = [self._finding(key[1], some) for key, some in sorted(hits.items()) if not _of_the_other(key, hits)]
         note = f"; {passed} lines are excited by u and were not tested" if passed else ""
         what = "No mains hum was found" if tested else "No line of the mains could be tested"
         sentence = f"{what} ({tested} tests of 50 and 60 Hz and harmonics{note})."
@@ -109,8 +109,7 @@ class Hum(Gate):
         sentence = (
             f"Channel {name!r} carries mains hum at {', '.join(f'{f:g}' for f in at_Hz)} Hz: at {line.at_Hz:.4g} Hz "
             f"{line.rms:.3g} {unit} r.m.s., {10 * np.log10(line.ratio):.0f} dB above the local floor, "
-            f"{100 * part:.2g} % of the channel's r.m.s. (record {record.record}). Check grounding and shielding; keep "
-            "these lines out of the fit."
+            f"{100 * part:.2g} % of the channel's r.m.s. (record {record.record}). Check grounding and shielding."
         )
         severity: Severity = "warning" if part > SETTINGS.large else "note"
         picture = self._picture(record, line.channel, at_Hz)
@@ -122,6 +121,18 @@ class Hum(Gate):
         series = Series(name, kept.f[1:], kept.asd[1:, j])
         limits = tuple(Limit(f"{f:g} Hz", f, "x") for f in at_Hz)
         return over_frequency(f"Record {kept.record}, {name}", label, (series,), limits)
+
+
+def _of_the_other(key: tuple[int, float], hits: Mapping[tuple[int, float], Sequence[tuple[_Kept, _Line]]]) -> bool:
+    """Whether all lines of a channel and mains frequency are harmonics of the other one as well (300 Hz), of which the
+    channel has further lines."""
+    channel, mains = key
+    other = MAINS_HZ[1 - MAINS_HZ.index(mains)]
+
+    def foreign(of: float, divisor: float) -> bool:
+        return any(round(hit.at_Hz / of) * of % divisor for _, hit in hits.get((channel, of), ()))
+
+    return foreign(other, mains) and not foreign(mains, other)
 
 
 def _length(samples: int, rate: float) -> int:

@@ -37,12 +37,13 @@ def before_after(found: GapFinding) -> Section:
     """Errors on held-out data as figures and numbers, and measured responses compared with both models."""
     gap = found.gap
     seen = gap_overlay(found.measured, gap.baseline, gap.updated)
+    hum = any(one.name == "mains_hum" for one in (*gap.effects, *gap.traces))
     return section(
         "The gap before and after" if gap.effects else "The gap",
         "before_after",
         spectrum(gap.heat, bool(gap.effects)) if gap.heat is not None else None,
         _stages(gap),
-        Paragraph(seen, "note") if isinstance(seen, str) else responses(seen, bool(gap.effects)),
+        Paragraph(seen, "note") if isinstance(seen, str) else responses(seen, bool(gap.effects), hum),
     )
 
 
@@ -59,9 +60,9 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
         panels.append(Panel(hertz(), Axis("residual / noise power [-]", "log"), curves, (), title))
     return Figure(
         "gap_spectrum",
-        "The gap on held-out data: power of the residual relative to that of the "
-        "measured noise, by frequency band. For a complete model the mean is 1, and the "
-        f"largest of the {heat.before.shape[1]} values, one per output and record, a little more.",
+        "The gap on held-out data: power of the residual relative to that of the measured noise, by frequency band. "
+        f"For a complete model the mean is 1, and the largest of the {heat.before.shape[1]} values, one per output "
+        "and record, a little more. Far below 1, the noise is overestimated.",
         panels,
         2,
         0.95,
@@ -104,35 +105,36 @@ def _stages(gap: Gap) -> Table:
         rows.append(("noise alone", words.percent(noise), "1", "1"))
     return table(
         "All models but the nominal one are fitted to the same records; the figures are those of held-out data: "
-        f"{gap.held_out}. Error: r.m.s. of the residual "
-        "relative to that of the measured outputs.",
+        f"{gap.held_out}. n.r.m.s. error: of the residual over that of the measured outputs, in which the resonances "
+        "of the suspension dominate. Chi-square: each line is divided by its noise, so that a weak resonance at high "
+        "frequency counts as well.",
         ("stage", "n.r.m.s. error", "error / noise", "chi-square / dof"),
         rows,
     )
 
 
-def responses(seen: GapOverlay, named: bool) -> list[Piece]:
-    """Description and figure of the input-output pairs that disagree most."""
+def responses(seen: GapOverlay, named: bool, hum: bool = False) -> list[Piece]:
+    """Description and figure of the input-output pairs that disagree most. hum : whether the records contain hum."""
     pairs, who = worst_pairs(seen), "updated" if named else "re-identified"
     text = (
-        f"Frequency responses from records {', '.join(seen.records)}, some of which were fitted. Points: "
-        f"{seen.method}. The figure shows the {len(pairs)} paths with the largest error of the re-identified "
-        "model, in standard deviations of the measured response; each path has a different output."
+        f"The figure shows the {len(pairs)} paths with the largest error of the re-identified model, in standard "
+        "deviations of the measured response; each path has a different output. Points: frequency responses from "
+        f"records {', '.join(seen.records)}, some of which were fitted; {seen.method}."
     )
     if seen.method.startswith(BESIDE):
         text += (
-            " From these records, no response can be estimated without a model. The points are therefore the "
-            f"linear part of the {who} model plus its residual, regressed on the inputs in windows of spectral "
-            "lines. They depend on that model: a model error narrower than a window is visible only in the "
-            "residual above."
+            " These records are too few to separate the drives without a model. The points are therefore the linear "
+            f"part of the {who} model plus its residual, regressed on the inputs in windows of spectral lines. An "
+            "error narrower than a window is visible only in the figure of the gap by frequency."
         )
     if seen.simulated:
         have = "has" if len(seen.simulated) == 1 else "have"
         text += (
-            f" {joined(list(map(wording.titled, seen.simulated))).capitalize()} {have} no frequency response. "
-            "That of the updated model is therefore estimated in the same way as the measured one, from a "
-            "simulation of the same records."
+            f" {joined(list(map(wording.titled, seen.simulated))).capitalize()} {have} no frequency response. The "
+            f"response of the {who} model is therefore estimated in the same way from a simulation of these records."
         )
+    if hum:
+        text += " Peaks at multiples of the mains frequency are hum, which these records still contain."
     if seen.left_out:
         names = joined(list(map(wording.titled, seen.left_out)))
         text += (
@@ -150,7 +152,7 @@ def responses(seen: GapOverlay, named: bool) -> list[Piece]:
         "gap_responses",
         f"Left: magnitude, {points} with a band of two standard deviations to "
         "each side. Right: magnitude of the complex difference between measured and model; with noise "
-        "alone 86 % of the points lie below the dotted line.",
+        "alone 86 % of the values lie below the dotted line.",
         panels,
         2,
         0.68,

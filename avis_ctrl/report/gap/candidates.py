@@ -14,9 +14,10 @@ def candidates(found: GapFinding) -> Section:
     """Candidates that were fitted but not named, the most probable first."""
     ranked = sorted(found.gap.considered, key=lambda one: (-one.probability, one.chi2_per_dof))
     caption = (
-        "Candidates that were fitted together with all parameters of the rig, and the reason for rejection. Chi-square "
-        "is that of selected lines of the held-out records, dense at the resonances, and differs from that of all "
-        "lines."
+        "Candidates that were fitted together with all parameters of the rig, and the reason for rejection. "
+        "Chi-square is that of selected lines of the held-out records, dense at the resonances, and differs from "
+        "that of all lines. Step: effects are added one by one. Form: another law, or number of modes, of an effect. "
+        "Probability: the smaller of two odds (section on the method); it need not follow the log evidence."
     )
     others = ranked[SETTINGS.candidates :]
     return section(

@@ -25,10 +25,10 @@ LOOKS = {
 HOW = {
     "silent": "Noise and unmeasured inputs are measured on lines where the drives are silent; any power of the "
     "excited lines beyond this and beyond a linear response is counted as not linear.",
-    "levels": "No line is free of the drives. The residual at the lowest level, without the model's own nonlinear "
-    "terms, is therefore attributed to noise and unmeasured inputs, which do not grow with the drives; "
-    "any additional residual at a higher level is not linear. Nonlinearity at the lowest level that is "
-    "not in the model counts as unmeasured inputs.",
+    "levels": "The drives excite every line, so noise cannot be measured by itself. At the lowest level, what "
+    "remains after the linear response and the model's own nonlinear terms counts as noise and unmeasured inputs, "
+    "which do not grow with the drives; this includes nonlinearity that is not in the model. Whatever is larger at a "
+    "higher level counts as not linear.",
     "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
     'from nonlinearity that is not in the model: "not linear" contains only the model\'s own '
     'nonlinear terms, and "unmeasured inputs" all else that does not follow the drives linearly.',
@@ -55,8 +55,8 @@ def by_record(gap: Gap) -> Figure:
         "Residual of each record, relative to the noise. Filled: held-out records; open: fitted. A missing linear "
         "effect gives an error in proportion to the level. An error that is the same at every level is noise or "
         "unmeasured floor motion; one that grows in any other way depends on amplitude. A slope over time at one "
-        "level is drift. The frequency lines are a random selection, dense near resonances, the same for all "
-        "records: these values differ from those of all lines in the table of stages.",
+        "level is drift. Drawn is the root of chi-square per degree of freedom, on lines that are selected at random "
+        "and dense near resonances; it differs from the ratio of error and noise in the table of stages.",
         panels,
         2,
         0.85,
@@ -109,10 +109,10 @@ def _explained(one: PowerShares) -> str:
     )
     narrow = float(np.min(np.diff(one.bands_Hz)))
     return (
-        f"Multiple coherence is the black and the orange part together. {HOW[one.how]}{unknown} Linear: the "
-        "response of the model with smooth corrections and, if they fit much better, up to two shifted poles in each "
-        f"band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) "
-        "is partly counted as not linear."
+        f"Multiple coherence is the sum of the first two parts, those that are linear. {HOW[one.how]}{unknown} "
+        "Linear: the response of the model with smooth corrections and, if they fit much better, up to two shifted "
+        f"poles in each band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) is "
+        "partly counted as not linear."
     )
 
 
@@ -146,13 +146,19 @@ def _whole(one: PowerShares) -> Table:
     """Fractions of the power over all bands together."""
     keys = [key for key in LOOKS if key in one.whole]
     rows = [
-        (output, *(words.percent(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
+        (output, *(_part(float(one.whole[key][k]), 5 if key == "model" else 2) for key in keys))
         for k, output in enumerate(one.outputs)
     ]
     return table(
-        f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which "
-        "lies at the resonances.",
+        f"The whole band at {words.number(one.level_V)} V: fractions of each output's power, most of which lies at "
+        "the resonances; 0.01 % of the power is 1 % r.m.s. Unmeasured inputs and sensors' noise together are what "
+        "other sections call noise. A linear error has the same fraction at every level.",
         ("output", *(LOOKS[key][2] for key in keys)),
         rows,
         "l" + "r" * len(keys),
     )
+
+
+def _part(fraction: float, digits: int) -> str:
+    """A fraction of the power in per cent; zero if nothing significant was found."""
+    return "none found" if fraction == 0 else words.percent(fraction, digits)

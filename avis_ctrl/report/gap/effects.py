@@ -77,7 +77,7 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
         if name.startswith(f"{LargeMotion.name}@"):
             continue
         new = after.get(name, np.nan)
-        shown, spread = words.number(new, 5), "not by itself" if name in shared else "not stated"
+        shown, spread = words.number(new, 5), "in combination" if name in shared else "not stated"
         if name in sigma and name not in shared:
             shown, spread = words.with_std(new, sigma[name])
         change = f"{100 * (new / value - 1):+.2f} %" if value and np.isfinite(new) else "none"
@@ -88,8 +88,9 @@ def _rig(gap: Gap, groups: Sequence[Sequence[str]]) -> Table:
             "The rig's own parameters as re-identified.", ("parameter", "value", "± 1 σ", "unit"), rows, "lrrl"
         )
     return table(
-        "A model without the effect is fitted with biased parameters; the change shows by how much. "
-        "A large change need not be wrong: the data may hardly determine that combination.",
+        "Change: from the re-identified to the updated model, due to the effects and to the other values of the rig "
+        "file, which only the updated model fits. A change that is not much larger than one standard deviation means "
+        "little.",
         ("parameter", "re-identified", "updated", "± 1 σ", "change", "unit"),
         rows,
         "lrrrrl",
@@ -100,9 +101,8 @@ def _together(groups: Sequence[Sequence[str]]) -> Paragraph | None:
     """Parameters that the records determine only in combination."""
     told = "; ".join(joined(list(group)) for group in groups)
     text = (
-        f"Records of the table as it is determine {told} only in combination. Their individual values follow from the "
-        "combination and the rig file. Records with mounts raised or moved would determine them; `avis identify` names "
-        "such records."
+        f"These records determine only combinations of: {told}. The individual values follow from the combination and "
+        "the rig file. Records with mounts raised or moved would determine them; avis identify names such records."
     )
     return Paragraph(text, "note") if groups else None
 
@@ -116,8 +116,9 @@ def _always(gap: Gap) -> Paragraph | None:
             told.append(f"{wording.titled(name.rpartition('.')[2])} {' ± '.join(both)}")
     text = (
         "Every model, with or without a named effect, also contains the second-order terms of large rotations, which "
-        "exist in every table. Their factors, 0 or 1 in theory, are fitted as well and are often poorly determined: "
-        f"{'; '.join(told)}."
+        "exist in every table. Their factors are fitted, too, and are often poorly determined: that of the mounts "
+        "(in theory 1), and the fractions of the payload's rotation that the axes of drives and of sensors follow (1 "
+        f"if they are fixed to the payload, 0 if to the chassis): {'; '.join(told)}."
     )
     return Paragraph(text, "note") if told else None
 

@@ -38,7 +38,7 @@ def opening(found: GapFinding) -> Section:
         Paragraph(in_numbers(gap)),
         ladder(gap),
         named(gap, CHANCES),
-        [Paragraph(_group(one)) for one in gap.effects if one.indistinguishable_from],
+        [Paragraph(_group(one, gap)) for one in gap.effects if one.indistinguishable_from],
         Paragraph(limits) if gap.detectable else None,
         Bullets(more),
         Paragraph(f"What to measure next: {next_step(found)}"),
@@ -63,8 +63,16 @@ def in_numbers(gap: Gap) -> str:
     return text + "."
 
 
-def _group(one: NamedEffect) -> str:
-    names = [wording.titled(one.name), *map(wording.titled, one.indistinguishable_from)]
+def _group(one: NamedEffect, gap: Gap) -> str:
+    """What it means that other effects explain the records as well; they may have been found, too."""
+    others = list(map(wording.titled, one.indistinguishable_from))
+    names = [wording.titled(one.name), *others]
+    if {each.name for each in (*gap.effects, *gap.traces)} >= set(one.indistinguishable_from):
+        return (
+            f"When {names[0]} was found, {joined(others)} explained these records almost as well, and was added later: "
+            "the updated model has both. Part of what is attributed to one may belong to the other. See the section on "
+            "what to measure next."
+        )
     return (
         f"These records cannot distinguish {joined(names)}. {'Either' if len(names) == 2 else 'Any'} of them may be "
         "the cause, and so may a cause that was not among the candidates. See the section on what to measure next."
@@ -82,10 +90,11 @@ def _stage(name: str) -> str:
 def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
     return listed(
-        "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on "
-        "held-out data without this effect, divided by the residual power beyond noise of the "
-        "model without effects. (In place of structural damping, the mounts then have viscous damping that is equal "
-        f"at the suspension resonances.) Effects below 1 % are called traces.{remark}",
+        "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on held-out "
+        "data if this effect alone is removed and nothing is fitted again, divided by the residual power beyond noise "
+        "of the model without effects; the fractions need not add up to 100 %. (In place of structural damping, the "
+        "mounts then have viscous damping that is equal at the suspension resonances.) Effects below 1 % are called "
+        f"traces.{remark}",
         [*gap.effects, *gap.traces],
         {
             "effect": lambda one: f"{wording.titled(one.name)}{' (trace)' if one in gap.traces else ''}",

@@ -58,7 +58,8 @@ def heat_map(heat: HeatMap, named: bool) -> Figure:
     return Figure(
         "heat_map",
         "Power of the residual on held-out data relative to that of the measured noise, by "
-        "channel and frequency band. White: noise alone. Grey: no data. Logarithmic colours.",
+        "channel and frequency band. White: noise alone. Blue: below the estimated noise. Grey: no data. Logarithmic "
+        "colours.",
         panels,
         len(panels),
         max(0.75, min(2.4, 0.085 * n + 0.25)),
@@ -73,9 +74,10 @@ def _short(name: str) -> str:
 def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
     return listed(
-        f"{caption}Fraction: of the total residual power beyond noise. Power / noise: residual power in this band "
-        "divided by noise power. p-value: probability of such a residual by noise alone, corrected for the number "
-        "of places tested (family-wise).",
+        f"{caption}The largest ones, with the drive with which the residual is most coherent, if there is one. "
+        "Fraction: of the total residual power beyond noise, each line divided by its noise. Power / noise: residual "
+        "power in this band divided by noise power. p-value: probability of such a residual by noise alone, "
+        "corrected for the number of places tested (family-wise).",
         places,
         {
             "place": wording.place,

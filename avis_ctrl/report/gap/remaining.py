@@ -69,7 +69,7 @@ def _left(gap: Gap) -> str:
     level = {
         True: "It grows faster than the drives: its cause is not linear.",
         False: "It does not grow faster than the drives.",
-        None: "From these records it is not known whether it grows faster than the drives.",
+        None: "It is too small, or the records are too few, to show whether it grows faster than the drives.",
     }[left.grows_with_level]
     places = (
         "The table below lists where it lies."

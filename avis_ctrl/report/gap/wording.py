@@ -9,6 +9,7 @@ import numpy as np
 from avis_ctrl.gap.effects.base import Effect, Reported
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
+from avis_ctrl.gap.settings import SETTINGS as GAP
 from avis_ctrl.report import words
 from avis_ctrl.report.pieces import Paragraph
 from avis_ctrl.summary import joined
@@ -21,10 +22,10 @@ CLAIMS = {
     "response, and no effect is named except traces. An effect "
     "can still be present if it is too weak for this campaign, if these records do not excite it, or if "
     "the parameters of the rig can imitate it.",
-    "explained": "Verdict: explained. On held-out records the re-identified model has a residual beyond noise. "
-    "Refitted values and the effects named above remove at least 90 % of its power, or the rest is noise.",
+    "explained": "Verdict: explained. Refitted values and the effects named above remove {removed} of the power that "
+    "the residual of the re-identified model has beyond noise, on held-out records.",
     "partly explained": "Verdict: partly explained. The effects named above meet all conditions for being named. "
-    "With the refitted values they remove less than 90 % of the power that the residual of the "
+    "With the refitted values they remove {removed} of the power that the residual of the "
     "re-identified model has beyond noise. The rest is described below. The updated model is "
     "better, not complete.",
     "unexplained": "Verdict: unexplained. Model and held-out records disagree. Neither refitted values nor any effect "
@@ -41,8 +42,13 @@ RAISED = (
 
 def claim(gap: Gap) -> str:
     """What the verdict claims, and what it does not."""
+    left = gap.left.share if gap.left else np.nan
+    removed = words.percent(max(1 - left, 0.0)) if np.isfinite(left) else "a part"
+    rest = " The rest is within the uncertainty of the noise." * (
+        gap.verdict == "explained" and left > 1 - GAP.explained
+    )
     return (
-        CLAIMS[gap.verdict]
+        CLAIMS[gap.verdict].format(removed=removed) + rest
         if not gap.raised
         else RAISED.format(
             verdict=gap.verdict,
@@ -75,11 +81,11 @@ def what_it_is(effect: NamedEffect) -> str:
 
 
 def probability(value: float) -> str:
-    """A probability in per cent, never 0 or 100."""
+    """A probability in per cent, never 0 and at most `GapSettings.most_sure`."""
     if not np.isfinite(value):
         return "not computed"
-    if value > 0.999:
-        return "> 99.9 %"
+    if value >= GAP.most_sure:
+        return f"≥ {100 * GAP.most_sure:g} %"
     return "< 0.1 %" if value < 0.001 else f"{words.number(100 * value)} %"
 
 
@@ -106,5 +112,7 @@ def place(one: Where) -> str:
 
 
 def candidate(one: Considered) -> str:
-    """Name and place of a candidate."""
-    return f"{titled(one.name)} ({one.location})" if one.location else titled(one.name)
+    """Name, place and law of a candidate."""
+    place, _, law = one.location.partition("/")
+    words = ", ".join([*([place] if place else []), *([f"form {law!r}"] if law else [])])
+    return f"{titled(one.name)} ({words})" if words else titled(one.name)
