@@ -15,7 +15,7 @@ sections = {
                     "actuator_chains": {"low_percent": 10.0, "crossover_Hz": 150.0, "high_percent": 400.0}},
     "transmissibility": {"peak_dB": 3.5, "band_dB": -12.0, "band_Hz": [4.0, 16.0], "transition_octaves": 0.8,
                          "tolerance_dB": 1.0},
-    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 30.0},
+    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 300.0},
     "floor": {"velocity_rms_m_per_s": 2e-5},
     "synthesis": {"max_iterations": 8, "target_mu": 0.95},
     "simulation": {"duration_s": 40.0, "random_plants": 20, "seed": 1},

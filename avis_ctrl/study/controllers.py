@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
+from avis_ctrl.robust.mu_descent import GainLimit
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
 from avis_ctrl.robust.musyn_iteration import Options
@@ -21,6 +23,7 @@ from avis_ctrl.robust.reduction import reduce_controller, replace_fast_by_lags, 
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import Candidate, ControllerResult
 from avis_ctrl.study.plant import DesignPlant
+from avis_ctrl.study.roll_off import gain_limit
 from avis_ctrl.uncertainty.blocks import BlockStructure
 
 
@@ -33,16 +36,18 @@ class ReductionSettings:
         mu are added; both are narrower than the grid. Below the band mu bounds the drive voltage for the offset of the
         electronics.
     accuracy : relative accuracy of the square of mu on the grid, small compared with the default reduction cost.
-    lag_orders, lag_corners : orders and corners tried for `replace_fast_by_lags` if poles above half the sample rate
-        remain; corners as fractions of half the sample rate. The first lags that raise mu by no more than the reduction
-        cost are used: the lower their corner, the less Tustin's rule changes the controller. Three lags can compensate
-        a third-order anti-alias filter; amplifier and delay may need more.
+    lag_orders, lag_corners : orders and corners tried for `replace_fast_by_lags` if the reduced controller is too fast
+        for its processor; corners as fractions of half the sample rate. The first lags that raise mu by no more than
+        the reduction cost are used: the lower their corner, the less Tustin's rule changes the controller. Three lags
+        can compensate a third-order anti-alias filter; amplifier and delay may need more.
+    between : points between two frequencies of `roll_off.gain_limit` at which the gain of a controller is compared.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
     accuracy: float = 1e-3
     lag_orders: tuple[int, ...] = (3, 6)
     lag_corners: tuple[float, ...] = (0.2, 0.3, 0.45, 0.7, 1.0)
+    between: int = 3
 
 
 SETTINGS = ReductionSettings()
@@ -96,17 +101,15 @@ def mu_optimal(
         ),
         starts=[one.K for one in rivals if one.K is not None],
     )
-    K, note = _reduced(plant, rig, made, asked.reduction_cost_percent / 100, design.control_effort.offset_corner_Hz)
+    K, note = _reduced(design, plant, rig, made)
     old = ("synthesis.time_limit_s is ignored: max_iterations and target_mu end the iteration",)
     notes = (made.status, *(old if asked.time_limit_s is not None else ()), note)
     return Candidate("mu", "mu synthesis", "mu", K, notes), made
 
 
-def _reduced(
-    plant: DesignPlant, rig: Rig, made: DKIteration, cost: float, offset_corner_Hz: float
-) -> tuple[StateSpace, str]:
+def _reduced(design: Design, plant: DesignPlant, rig: Rig, made: DKIteration) -> tuple[StateSpace, str]:
     """The controller of lowest order whose complex mu grows by no more than the cost, and a note on the reduction."""
-    P = plant.synthesis
+    P, cost = plant.synthesis, design.synthesis.reduction_cost_percent / 100
     blocks = P.all_blocks.simplified() if P.all_blocks.many else P.all_blocks.complexified()
     omega = reduction_grid(plant, made.omega_peak)
 
@@ -120,24 +123,43 @@ def _reduced(
 
     def lowest_order(start: StateSpace) -> StateSpace:
         # No weight changes below the corner up to which the offset may drift.
-        lasting = truncate_slow(start, 2 * np.pi * offset_corner_Hz / 3)
+        lasting = truncate_slow(start, 2 * np.pi * design.control_effort.offset_corner_Hz / 3)
         start = lasting if harmless(lasting) else start
         return reduce_controller(P.P, start, lambda one: peak(P.closed(one), goal=limit), limit=limit)
 
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
-    # gain is kept) if mu allows it. If the reduced controller still has such poles, lags replace them.
-    nyquist = np.pi * rig.sample_rate_Hz
+    # gain is kept) if mu allows it. If the reduced controller still has such poles, poles that the design excludes, or
+    # more gain beyond the Nyquist frequency than the proof of its code allows, lags replace them.
+    nyquist, roll_off = np.pi * rig.sample_rate_Hz, _roll_off(plant, rig)
+    fastest = min([nyquist, *(2 * np.pi * f for f in design.upper_limits("fastest_controller_pole_Hz"))])
     residual = residualise_fast(K, nyquist, also_unstable=True)
     first = lowest_order(residual if harmless(residual) else K)
-    lags = (
-        replace_fast_by_lags(K, part * nyquist, order) for order in SETTINGS.lag_orders for part in SETTINGS.lag_corners
-    )
-    candidates = chain([first], map(lowest_order, filter(harmless, lags)))
-    reduced = next((one for one in candidates if np.max(np.abs(one.poles()), initial=0.0) <= nyquist), first)
+
+    def below(limit: float) -> Callable[[StateSpace], bool]:
+        return lambda one: bool(np.max(np.abs(one.poles()), initial=0.0) <= limit)
+
+    def certifiable(one: StateSpace) -> bool:
+        return below(fastest)(one) and (roll_off is None or roll_off.holds(one, SETTINGS.between))
+
+    def found(accepted: Callable[[StateSpace], bool]) -> StateSpace | None:
+        """The first controller that is accepted, before and after its reduction."""
+        lags = (replace_fast_by_lags(K, f * nyquist, n) for n in SETTINGS.lag_orders for f in SETTINGS.lag_corners)
+        made = (lowest_order(one) for one in lags if accepted(one) and harmless(one))
+        return next(filter(accepted, chain([first], made)), None)
+
+    reduced = found(certifiable) or found(below(nyquist)) or first
     return reduced, (
         f"reduced from {K.nstates} to {reduced.nstates} states: complex mu, at {omega.size} frequencies "
         f"and the resonances of each loop, changes from {full:.4f} to {peak(P.closed(reduced)):.4f}"
     )
+
+
+def _roll_off(plant: DesignPlant, rig: Rig) -> GainLimit | None:
+    """Limit of the gain beyond half the sample rate; None for a table whose gain there is not bounded."""
+    try:
+        return gain_limit(plant, rig.sample_rate_Hz)
+    except ComputationError:
+        return None
 
 
 def peak_of_loop(closed: StateSpace, blocks: BlockStructure, omega: np.ndarray, goal: float = 0.0) -> float:

@@ -64,7 +64,7 @@ _AVIS: dict[str, Any] = _COMMON | {
 _HALCYONICS: dict[str, Any] = _COMMON | {
     "uncertainty": {"actuator_chains": _CHAINS | {"crossover_Hz": 150.0}},
     "transmissibility": _EDGES | {"band_dB": -12.0, "band_Hz": [4.0, 16.0]},
-    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0},
+    "control_effort": {"floor_velocity_m_per_s": 1e-4, "bandwidth_Hz": 150.0, "reduction": 300.0},
     "floor": {"velocity_rms_m_per_s": 2e-5},
     "synthesis": {"target_mu": 0.95},
 }
