@@ -126,8 +126,8 @@ def _not_proved(folder: DesignFolder, name: str, arithmetic: Arithmetic, reasons
     return ComputationError(
         f"the loop of the exported controller {name!r} is not proved stable; nothing was written",
         measured=reasons,
-        next_step=f"try {precise}{further}; or design with a larger control_effort.reduction, so that the voltages fall "
-        "off before half the sample rate",
+        next_step=f"try {precise}{further}; or design with a larger control_effort.reduction, so that the voltages "
+        "fall off before half the sample rate",
     )
 
 

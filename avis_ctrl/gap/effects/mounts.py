@@ -18,9 +18,6 @@ from avis_ctrl.gap.score import Score, reduction, symmetric_coordinates
 from avis_ctrl.gap.starting_values import SETTINGS, Seed
 from avis_ctrl.rigs.rig import Rig
 
-# Suffix of a place: viscous damping in place of a loss that is independent of frequency.
-VISCOUS = " viscous"
-
 
 def has_mounts(model: Table) -> bool:
     """Whether the rig has named stiffness and damping parameters of its mounts."""
@@ -78,22 +75,23 @@ class StructuralDamping(OfMounts):
     title = "beside viscous damping, the mounts have a loss that hardly depends on frequency"
     looks_like = "more damping at low resonances and less at high ones than with dashpots"
     at = ("isolators/causal", "isolators/complex")
+    viscous = " viscous"  # suffix of a place: its law in a rig file
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return (EffectParameter("loss_factor", "1", "loss factor of the mounts", 0.0, 0.0, 1.0, 0.05),)
 
     def instead(self, place: str) -> str:
-        return place + VISCOUS
+        return place + self.viscous
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        law, eta = place.removesuffix(VISCOUS), values["loss_factor"]
+        law, eta = place.removesuffix(self.viscous), values["loss_factor"]
 
         def factor(s: np.ndarray) -> np.ndarray:
             if law.endswith("complex"):
                 return np.full(len(s), 1 + 1j * eta)
             return np.asarray((s / (2 * np.pi * LIBRARY.loss_Hz)) ** (2 / np.pi * np.arctan(eta)))
 
-        if place.endswith(VISCOUS):
+        if place.endswith(self.viscous):
             w = ops.mounts.resonances(ops.base.matrices.M)
             at_resonance = factor(1j * w)
             ops.stiffness_factor = ops.stiffness_factor * (at_resonance.real + ops.s[:, None] / w * at_resonance.imag)
