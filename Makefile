@@ -50,7 +50,7 @@ gallery: export AVIS_DOCS = gallery
 gallery: docs
 
 # Minutes each; the campaigns of hours beside them (gates, random_plants, sound_campaigns, mutations, own_tables, blind)
-# and the twenty minutes of design_orders are started by hand.
+# and those of half an hour (design_orders, shipped_designs) are started by hand.
 BENCHMARKS = ekf_vs_filterpy hinfsyn interval_coverage maximum_likelihood mu_upper musyn_vs_dkpy sequential sweep
 
 # The peers that we measure ourselves against are no dependency of the product.

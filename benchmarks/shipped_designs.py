@@ -2,8 +2,8 @@
 
     python -m benchmarks.shipped_designs [avis_z_phix ...]
 
-Each design of designs/*.toml is computed and exported; the rows are those of the page, to compare or to paste. For
-avis_z_phix, `--order 6` is computed, too. Half an hour for all four. On another type of processor D-K iteration may end
+Each design of designs/*.toml is computed and exported, and its column of each table is printed. For avis_z_phix,
+`--order 6` is computed, too. Half an hour for all four. On another type of processor D-K iteration may end
 at slightly different controllers.
 """
 
@@ -14,7 +14,6 @@ import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import avis_ctrl as ac
 from avis_ctrl.export.design_folder import DesignFolder, open_design
@@ -37,11 +36,13 @@ def figures(folder: DesignFolder, packages: Sequence[Package]) -> dict[str, str]
     """A column of the table "The shipped designs" of docs/export.md, by row; packages : float64, float32."""
     worst = folder.result["worst_cases"]["mu"]
     mu, peak, band = worst["mu"]["upper"], decibels(worst["peak"]["upper"]), decibels(worst["band"]["upper"])
-    found = [one.certificate.content for one in packages]
-    written = [json.loads(one.contents["certificate.json"]) for one in packages]
+    found = [json.loads(one.contents["certificate.json"]) for one in packages]
 
     def each(key: str, digits: str) -> str:
         return ", ".join(f"{one[key]:{digits}}" for one in found)
+
+    def tolerances(key: str) -> str:
+        return ", ".join(f"{one[key]['tolerance_V']:.1e}" for one in found)
 
     def source(one: Package) -> str:
         return f"{sum(len(text) for name, text in one.contents.items() if name[-2:] in ('.c', '.h')) / 1000:.1f}"
@@ -57,15 +58,11 @@ def figures(folder: DesignFolder, packages: Sequence[Package]) -> dict[str, str]
         "gain at zero frequency [V/V], [N s/m]": f"{rest['gain_V_per_V']:.0f}, {rest['gain_Ns_per_m']:.1e}",
         "offset [mV]; drive voltage [V]": f"{1e3 * rest['offset_V']:.2f}; {rest['drive_V']:.2f}",
         "rounding noise at most [m/s]": each("rounding_noise_m_per_s", ".1e"),
-        "test_vectors.csv agrees within [V]": tolerances(written, "test_vectors"),
-        "restart_vectors.csv agrees within [V]": tolerances(written, "restart_vectors"),
+        "test_vectors.csv agrees within [V]": tolerances("test_vectors"),
+        "restart_vectors.csv agrees within [V]": tolerances("restart_vectors"),
         "states; execution time per sample [us]": f"{n}; {each('step_time_us', '.2g')}",
         "kilobytes of C and header": ", ".join(source(one) for one in packages),
     }
-
-
-def tolerances(certificates: Sequence[dict[str, Any]], key: str) -> str:
-    return ", ".join(f"{one[key]['tolerance_V']:.1e}" for one in certificates)
 
 
 def anti_windup(package: Package) -> list[str]:

@@ -462,11 +462,12 @@ def _considered(fits: Fits, names: Names, prepared: Prepared) -> tuple[Considere
             rows.append(
                 Considered(
                     effect.effect.name,
-                    effect.place,
+                    name_of(label)[1],
                     chi2,
                     min(probability[label], settings.most_sure),
                     reason,
                     reported,
+                    effect.place.partition("/")[2],
                 )
             )
     return tuple(sorted(rows, key=lambda one: -one.probability)[: settings.shown_runners_up])

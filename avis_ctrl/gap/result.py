@@ -21,7 +21,7 @@ def spoken(name: str, unit: str) -> str:
     """A parameter's name without its unit, which follows the number; of a rotation, "about" its axis. The values of
     mounts or drives that differ are fractions of their mean."""
     if name.startswith("uneven_"):
-        return f"{name.removeprefix('uneven_')} above the mean"
+        return f"deviation of {name.removeprefix('uneven_')} from the mean"
     tail = "".join(sign for sign in unit if sign not in " ^()").replace("/", "_per_").removeprefix("1").lstrip("_")
     words = (name.removesuffix(f"_{tail}") if tail else name).replace("_", " ")
     return re.sub(r"\br([xyz])$", r"about \1", words)
@@ -154,8 +154,8 @@ class Where:
 class Considered:
     """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named.
 
-    location : the place, with the law of the effect after a slash. probability : odds against the best candidate of
-        the same step, at most `GapSettings.most_sure`.
+    probability : odds against the best candidate of the same step, at most `GapSettings.most_sure`. law : of the
+        effect, if it has several.
     """
 
     name: str
@@ -164,6 +164,7 @@ class Considered:
     probability: float
     reason: str
     parameters: Mapping[str, Reported] = field(default_factory=dict)
+    law: str = ""
 
 
 @dataclass(frozen=True)

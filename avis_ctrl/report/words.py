@@ -97,7 +97,7 @@ def axis(name: str) -> str:
 
 def unit(text: str) -> str:
     """A unit with superscript powers; empty for the unit 1."""
-    return "" if text in ("1", "mixed units") else text.replace("^2", "²").replace("^3", "³").replace("^5", "⁵")
+    return "" if text in ("1", "mixed units") else re.sub(r"\^(\d)", lambda power: "⁰¹²³⁴⁵⁶⁷⁸⁹"[int(power[1])], text)
 
 
 def yes(value: bool) -> str:

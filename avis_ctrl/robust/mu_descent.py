@@ -82,11 +82,6 @@ class GainLimit:
         """The limit at other frequencies, by a power law between neighbouring points."""
         return np.exp(np.interp(np.log(omega), np.log(self.omega), np.log(self.most)))
 
-    def holds(self, K: StateSpace, between: int) -> bool:
-        """Whether the gain of K is within the limit at `frequencies`."""
-        omega = self.frequencies(K, between)
-        return bool(np.all(np.linalg.norm(K.frequency_response(omega), 2, axis=(1, 2)) <= self.at(omega)))
-
 
 @dataclass(frozen=True, eq=False)
 class Step:

@@ -15,7 +15,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.frequency_grid import merged, resonances
 from avis_ctrl.robust.hinfsyn import hinfsyn
-from avis_ctrl.robust.mu_descent import GainLimit
+from avis_ctrl.robust.mu_descent import GainLimit, Task
 from avis_ctrl.robust.mu_upper import upper_bound
 from avis_ctrl.robust.musyn import DKIteration, dk_iteration
 from avis_ctrl.robust.musyn_iteration import Options
@@ -40,14 +40,12 @@ class ReductionSettings:
         for its processor; corners as fractions of half the sample rate. The first lags that raise mu by no more than
         the reduction cost are used: the lower their corner, the less Tustin's rule changes the controller. Three lags
         can compensate a third-order anti-alias filter; amplifier and delay may need more.
-    between : points between two frequencies of `roll_off.gain_limit` at which the gain of a controller is compared.
     """
 
     frequencies_Hz: tuple[float, ...] = (*np.geomspace(1e-3, 0.03, 5).tolist(), *np.geomspace(0.05, 300.0, 25).tolist())
     accuracy: float = 1e-3
     lag_orders: tuple[int, ...] = (3, 6)
     lag_corners: tuple[float, ...] = (0.2, 0.3, 0.45, 0.7, 1.0)
-    between: int = 3
 
 
 SETTINGS = ReductionSettings()
@@ -130,24 +128,28 @@ def _reduced(design: Design, plant: DesignPlant, rig: Rig, made: DKIteration) ->
     # Tustin's rule distorts poles near and above the Nyquist frequency. Poles above it are residualised (only their DC
     # gain is kept) if mu allows it. If the reduced controller still has such poles, poles that the design excludes, or
     # more gain beyond the Nyquist frequency than the proof of its code allows, lags replace them.
-    nyquist, roll_off = np.pi * rig.sample_rate_Hz, _roll_off(plant, rig)
-    fastest = min([nyquist, *(2 * np.pi * f for f in design.upper_limits("fastest_controller_pole_Hz"))])
+    nyquist = np.pi * rig.sample_rate_Hz
+    roll_off = Task(P.P, P.all_blocks.complexified(), limit=_roll_off(plant, rig))
+    allowed = min([nyquist, *(2 * np.pi * f for f in design.upper_limits("fastest_controller_pole_Hz"))])
     residual = residualise_fast(K, nyquist, also_unstable=True)
     first = lowest_order(residual if harmless(residual) else K)
 
-    def below(limit: float) -> Callable[[StateSpace], bool]:
-        return lambda one: bool(np.max(np.abs(one.poles()), initial=0.0) <= limit)
+    def fastest(one: StateSpace) -> float:
+        return float(np.max(np.abs(one.poles()), initial=0.0))
 
     def certifiable(one: StateSpace) -> bool:
-        return below(fastest)(one) and (roll_off is None or roll_off.holds(one, SETTINGS.between))
+        return fastest(one) <= allowed and roll_off.gain(one) <= 1
+
+    def sampled(one: StateSpace) -> bool:
+        return fastest(one) <= nyquist
 
     def found(accepted: Callable[[StateSpace], bool]) -> StateSpace | None:
-        """The first controller that is accepted, before and after its reduction."""
+        """The first controller that is accepted, with lags also before their reduction."""
         lags = (replace_fast_by_lags(K, f * nyquist, n) for n in SETTINGS.lag_orders for f in SETTINGS.lag_corners)
         made = (lowest_order(one) for one in lags if accepted(one) and harmless(one))
         return next(filter(accepted, chain([first], made)), None)
 
-    reduced = found(certifiable) or found(below(nyquist)) or first
+    reduced = found(certifiable) or found(sampled) or first
     return reduced, (
         f"reduced from {K.nstates} to {reduced.nstates} states: complex mu, at {omega.size} frequencies "
         f"and the resonances of each loop, changes from {full:.4f} to {peak(P.closed(reduced)):.4f}"

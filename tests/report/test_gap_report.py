@@ -328,7 +328,7 @@ def test_terms_that_every_model_holds_are_no_effect(found):
         ("k3_N_per_m3", "N/m^3", "k3"),
         ("mass_kg", "kg", "mass"),
         ("damping", "1", "damping"),
-        ("uneven_1", "1", "1 above the mean"),
+        ("uneven_1", "1", "deviation of 1 from the mean"),
         ("slope_per_h", "1/h", "slope"),
     ],
 )

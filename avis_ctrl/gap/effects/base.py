@@ -234,7 +234,7 @@ class Effect(ABC):
 
     def instead(self, place: str) -> str:
         """Place with the law that a rig file states in place of the effect's own, with the same values; empty if it
-        states none. With this law the share of an effect is computed."""
+        states none. The share of an effect is its difference from this law."""
         return ""
 
     def rig_changes(self, model: Table, place: str, values: Values) -> dict[str, float]:

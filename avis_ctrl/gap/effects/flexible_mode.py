@@ -104,9 +104,9 @@ class PayloadFlexibleMode(Effect):
         found = list(super().reported(model, place, values, covariance).items())
         own = len(found) // COUNTS[place.partition("/")[2]]
         each = sorted((found[k : k + own] for k in range(0, len(found), own)), key=lambda mode: mode[0][1].value)
-        ordered = dict(zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True))
+        ordered = zip((name for name, _ in found), (value for mode in each for _, value in mode), strict=True)
         kinds = ("frequency", "damping", "shape")
-        return {name: ordered[name] for kind in kinds for name in ordered if name.startswith(kind)}
+        return dict(sorted(ordered, key=lambda named: kinds.index(named[0].partition("_")[0])))
 
 
 def modes(values: Values) -> list[tuple[float, float, np.ndarray]]:

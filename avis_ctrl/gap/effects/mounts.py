@@ -72,7 +72,7 @@ class StructuralDamping(OfMounts):
     """
 
     name = "structural_damping"
-    title = "beside viscous damping, the mounts have a loss that hardly depends on frequency"
+    title = "besides viscous damping, the mounts have a loss that hardly depends on frequency"
     looks_like = "more damping at low resonances and less at high ones than with dashpots"
     at = ("isolators/causal", "isolators/complex")
     viscous = " viscous"  # suffix of a place: its law in a rig file

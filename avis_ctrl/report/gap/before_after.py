@@ -62,7 +62,7 @@ def spectrum(heat: HeatMap, named: bool) -> Figure:
         "gap_spectrum",
         "The gap on held-out data: power of the residual relative to that of the measured noise, by frequency band. "
         f"For a complete model the mean is 1, and the largest of the {heat.before.shape[1]} values, one per output "
-        "and record, a little more. Far below 1, the noise is overestimated.",
+        "and record, a little more. Where it is far below 1, the noise is overestimated.",
         panels,
         2,
         0.95,
@@ -105,9 +105,9 @@ def _stages(gap: Gap) -> Table:
         rows.append(("noise alone", words.percent(noise), "1", "1"))
     return table(
         "All models but the nominal one are fitted to the same records; the figures are those of held-out data: "
-        f"{gap.held_out}. n.r.m.s. error: of the residual over that of the measured outputs, in which the resonances "
-        "of the suspension dominate. Chi-square: each line is divided by its noise, so that a weak resonance at high "
-        "frequency counts as well.",
+        f"{gap.held_out}. n.r.m.s. error: r.m.s. of the residual over that of the measured outputs, in which the "
+        "resonances of the suspension dominate. Chi-square: each line is divided by its noise, so that a weak "
+        "resonance at high frequency counts as well.",
         ("stage", "n.r.m.s. error", "error / noise", "chi-square / dof"),
         rows,
     )

@@ -16,8 +16,9 @@ def candidates(found: GapFinding) -> Section:
     caption = (
         "Candidates that were fitted together with all parameters of the rig, and the reason for rejection. "
         "Chi-square is that of selected lines of the held-out records, dense at the resonances, and differs from "
-        "that of all lines. Step: effects are added one by one. Form: another law, or number of modes, of an effect. "
-        "Probability: the smaller of two odds (section on the method); it need not follow the log evidence."
+        "that of all lines. Steps are numbered in the order in which effects were added. Form: law of the effect, or "
+        "its number of modes. Probability: from the less certain of two odds (section on the method); it need not "
+        "follow the log evidence."
     )
     others = ranked[SETTINGS.candidates :]
     return section(

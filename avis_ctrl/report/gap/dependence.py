@@ -55,7 +55,7 @@ def by_record(gap: Gap) -> Figure:
         "Residual of each record, relative to the noise. Filled: held-out records; open: fitted. A missing linear "
         "effect gives an error in proportion to the level. An error that is the same at every level is noise or "
         "unmeasured floor motion; one that grows in any other way depends on amplitude. A slope over time at one "
-        "level is drift. Drawn is the root of chi-square per degree of freedom, on lines that are selected at random "
+        "level is drift. The values are the root of chi-square per degree of freedom, on lines selected at random "
         "and dense near resonances; it differs from the ratio of error and noise in the table of stages.",
         panels,
         2,
@@ -160,5 +160,5 @@ def _whole(one: PowerShares) -> Table:
 
 
 def _part(fraction: float, digits: int) -> str:
-    """A fraction of the power in per cent; zero if nothing significant was found."""
+    """A fraction of the power in per cent; it is zero where nothing significant was found."""
     return "none found" if fraction == 0 else words.percent(fraction, digits)

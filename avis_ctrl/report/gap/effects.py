@@ -30,7 +30,7 @@ def parameters(found: GapFinding) -> Section:
     return section(
         "Parameters",
         "parameters",
-        (_sizes(gap), Bullets(list(map(_as_text, named)))) if named else Paragraph(none),
+        (_sizes(gap), Bullets([_as_text(one, gap) for one in named])) if named else Paragraph(none),
         Fold(f"The rig's own parameters, re-identified{both}", own),
         tolerances(gap.tolerances),
     )
@@ -53,7 +53,7 @@ def _sizes(gap: Gap) -> Table:
     )
 
 
-def _as_text(one: NamedEffect) -> str:
+def _as_text(one: NamedEffect, gap: Gap) -> str:
     """Description of an effect: what it is, its influence on the responses, and its confirmation."""
     effect = wording.known(one.name)
     text = f"{wording.titled(one.name).capitalize()} ({one.location}): {wording.what_it_is(one)}."
@@ -62,8 +62,7 @@ def _as_text(one: NamedEffect) -> str:
     if one.confirmation:
         text += f" {words.sentence(one.confirmation)}"
     if one.indistinguishable_from:
-        names = joined(list(map(wording.titled, one.indistinguishable_from)))
-        text += f" These data cannot distinguish it from {names}."
+        text += f" {wording.rivals(one, gap)}"
     return text
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.gap.axis.result import AxisGap
-from avis_ctrl.gap.result import Gap, NamedEffect
+from avis_ctrl.gap.result import Gap
 from avis_ctrl.report import words
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import ladder
@@ -38,7 +38,7 @@ def opening(found: GapFinding) -> Section:
         Paragraph(in_numbers(gap)),
         ladder(gap),
         named(gap, CHANCES),
-        [Paragraph(_group(one, gap)) for one in gap.effects if one.indistinguishable_from],
+        [Paragraph(wording.rivals(one, gap)) for one in gap.effects if one.indistinguishable_from],
         Paragraph(limits) if gap.detectable else None,
         Bullets(more),
         Paragraph(f"What to measure next: {next_step(found)}"),
@@ -61,22 +61,6 @@ def in_numbers(gap: Gap) -> str:
         if gap.noise_nrmse > 0:
             text += f", and {words.number(last / gap.noise_nrmse)} times the noise"
     return text + "."
-
-
-def _group(one: NamedEffect, gap: Gap) -> str:
-    """What it means that other effects explain the records as well; they may have been found, too."""
-    others = list(map(wording.titled, one.indistinguishable_from))
-    names = [wording.titled(one.name), *others]
-    if {each.name for each in (*gap.effects, *gap.traces)} >= set(one.indistinguishable_from):
-        return (
-            f"When {names[0]} was found, {joined(others)} explained these records almost as well, and was added later: "
-            "the updated model has both. Part of what is attributed to one may belong to the other. See the section on "
-            "what to measure next."
-        )
-    return (
-        f"These records cannot distinguish {joined(names)}. {'Either' if len(names) == 2 else 'Any'} of them may be "
-        "the cause, and so may a cause that was not among the candidates. See the section on what to measure next."
-    )
 
 
 def _stage(name: str) -> str:

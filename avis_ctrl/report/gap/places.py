@@ -74,7 +74,7 @@ def _short(name: str) -> str:
 def table_of(places: Sequence[Where], caption: str) -> Table:
     """Table of bands and paths with their fraction of the residual power beyond noise."""
     return listed(
-        f"{caption}The largest ones, with the drive with which the residual is most coherent, if there is one. "
+        f"{caption}The largest places, each with the drive that is most coherent with the residual, if there is one. "
         "Fraction: of the total residual power beyond noise, each line divided by its noise. Power / noise: residual "
         "power in this band divided by noise power. p-value: probability of such a residual by noise alone, "
         "corrected for the number of places tested (family-wise).",

@@ -42,20 +42,17 @@ RAISED = (
 
 def claim(gap: Gap) -> str:
     """What the verdict claims, and what it does not."""
-    left = gap.left.share if gap.left else np.nan
-    removed = words.percent(max(1 - left, 0.0)) if np.isfinite(left) else "a part"
-    rest = " The rest is within the uncertainty of the noise." * (
-        gap.verdict == "explained" and left > 1 - GAP.explained
-    )
-    return (
-        CLAIMS[gap.verdict].format(removed=removed) + rest
-        if not gap.raised
-        else RAISED.format(
+    if gap.raised:
+        return RAISED.format(
             verdict=gap.verdict,
             sensors=joined(list(gap.raised)),
             with_effects=" with the effects named above" if gap.effects else "",
         )
-    )
+    left = gap.left.share if gap.left else np.nan
+    removed = words.percent(max(1 - left, 0.0)) if np.isfinite(left) else "a part"
+    within_noise = gap.verdict == "explained" and left > 1 - GAP.explained
+    rest = " The rest is within the uncertainty of the noise." * within_noise
+    return CLAIMS[gap.verdict].format(removed=removed) + rest
 
 
 def verdict(text: str, word: str) -> Paragraph:
@@ -78,6 +75,22 @@ def what_it_is(effect: NamedEffect) -> str:
     """Title of an effect."""
     listed = known(effect.name)
     return effect.title or (listed.title if listed else titled(effect.name))
+
+
+def rivals(one: NamedEffect, gap: Gap) -> str:
+    """Which effects these records cannot distinguish from a named one, whether or not the updated model has them."""
+    others = list(map(titled, one.indistinguishable_from))
+    names = [titled(one.name), *others]
+    if {each.name for each in (*gap.effects, *gap.traces)} >= set(one.indistinguishable_from):
+        return (
+            f"When {names[0]} was found, {joined(others)} explained these records almost as well. The updated model "
+            f"has {'both' if len(names) == 2 else 'all of them'}; part of what is attributed to one may belong to "
+            "another. See the section on what to measure next."
+        )
+    return (
+        f"These records cannot distinguish {joined(names)}. {'Either' if len(names) == 2 else 'Any'} of them may be "
+        "the cause, and so may a cause that was not among the candidates. See the section on what to measure next."
+    )
 
 
 def probability(value: float) -> str:
@@ -113,6 +126,5 @@ def place(one: Where) -> str:
 
 def candidate(one: Considered) -> str:
     """Name, place and law of a candidate."""
-    place, _, law = one.location.partition("/")
-    words = ", ".join([*([place] if place else []), *([f"form {law!r}"] if law else [])])
-    return f"{titled(one.name)} ({words})" if words else titled(one.name)
+    details = ", ".join(filter(None, [one.location, one.law and f"form {one.law!r}"]))
+    return f"{titled(one.name)} ({details})" if details else titled(one.name)
