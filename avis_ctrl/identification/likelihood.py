@@ -213,7 +213,7 @@ def descent(
         if (undamped - at.z) @ (at.g - at.z) < settings.converged * len(at.now.e):
             return at, steps
         for damping in _dampings(at.H, needed, settings):
-            z = _bounded_step(at, damping, bounds) if damping else undamped
+            z = priors.stepped(at.z, _bounded_step(at, damping, bounds) if damping else undamped)
             try:
                 # For a step that may be rejected, the derivative is not needed yet.
                 if not (damping or needed) or expand(z, False).whole < at.whole:

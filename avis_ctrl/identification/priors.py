@@ -83,6 +83,18 @@ class Priors:
         sigma[rows] *= factor
         return replace(self, sigma=sigma)
 
+    def stepped(self, z: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """(n,) standardised values whose parameters have moved as they would to first order from z to `end`.
+
+        Masses, stiffnesses and dampings add up, their logarithms do not: where the data determine a sum of dampings but
+        not each of them, equal and opposite steps of two logarithms change the sum, and a fit of z proceeds by ever
+        shorter steps. A positive parameter that would lose more than half of its value moves less.
+        """
+        sigma = np.where(self.positive, self.sigma, 1.0)
+        change = sigma * (end - z)
+        moved = np.where(change > -0.5, np.log1p(np.maximum(change, -0.5)), np.log(0.5) + 2 * (change + 0.5))
+        return np.clip(np.where(self.positive & np.isfinite(change), z + moved / sigma, end), *self.bounds)
+
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""
         return np.where(self.positive, self.sigma * self.values(z), self.sigma)
