@@ -83,17 +83,25 @@ def _folded(theta: np.ndarray) -> np.ndarray:
 
 
 class WindowForce:
-    """Force of an effect, window by window: from the samples of the window alone, or from all samples so far."""
+    """Force of an effect, window by window.
 
-    def __init__(self, one: ActiveEffect, record: RecordMotion):
+    memory : samples before a window on which the force in it depends; None for all of them.
+    """
+
+    def __init__(self, one: ActiveEffect, record: RecordMotion, window: int):
         self.one, self.record = one, record
-        self.local = self._is_local()
+        self.memory = self._memory(window)
 
-    def _is_local(self) -> bool:
-        """Whether the force at a sample depends on that sample alone; tested on half a record."""
-        whole = self._of(0, len(self.record.volts))
-        half = len(whole) // 2
-        return bool(np.allclose(whole[half:], self._of(half, len(whole)), 1e-9, 1e-12 * np.max(np.abs(whole))))
+    def _memory(self, window: int) -> int | None:
+        """No sample, a window, or all samples; tested on half a record."""
+        samples = len(self.record.volts)
+        whole, half = self._of(0, samples), samples // 2
+        least = 1e-12 * np.max(np.abs(whole))
+        for memory in (0, window):
+            since = max(half - memory, 0)
+            if np.allclose(whole[half:], self._of(since, samples)[half - since :], 1e-9, least):
+                return memory
+        return None
 
     def _of(self, start: int, stop: int) -> np.ndarray:
         r = self.record
@@ -108,7 +116,8 @@ class WindowForce:
 
     def __call__(self, start: int, stop: int) -> np.ndarray:
         """(stop - start, 6) force for the current deflection of the record."""
-        return self._of(start, stop) if self.local else self._of(0, stop)[start:]
+        since = 0 if self.memory is None else max(start - self.memory, 0)
+        return self._of(since, stop)[start - since :]
 
     def accept(self, start: int, stop: int) -> None:
         """Accept the deflection up to stop as final."""
@@ -117,12 +126,12 @@ class WindowForce:
 class FrictionForce(WindowForce):
     """Friction of contacts; their state is carried from window to window."""
 
-    def __init__(self, one: ActiveEffect, record: RecordMotion):
-        super().__init__(one, record)
+    def __init__(self, one: ActiveEffect, record: RecordMotion, window: int):
+        super().__init__(one, record, window)
         self.contacts = Contacts(record, one.by_name["slip_m"])
 
-    def _is_local(self) -> bool:
-        return False
+    def _memory(self, window: int) -> int | None:
+        return None
 
     def __call__(self, start: int, stop: int) -> np.ndarray:
         return pushed(self.contacts.friction(start, stop), self.record, self.one.by_name)
@@ -145,15 +154,18 @@ def march(
     ------
     ComputationError : a motion that grows without bound.
     """
-    forces = [(FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record) for one in effects]
     z, W, samples = free.copy(), by_force.window, len(free)
+    forces = [
+        (FrictionForce if type(one.effect) is ContactFriction else WindowForce)(one, record, W) for one in effects
+    ]
     total, largest = np.zeros((samples, N_Q)), float(np.max(np.abs(record.deflection), initial=0.0))
 
     def forced(start: int, here: slice) -> np.ndarray:
         """(samples, 6) force of all effects; an effect with memory starts from its state at the start of the window."""
         found = np.zeros((here.stop - here.start, N_Q))
         for force in forces:
-            found += force(here.start, here.stop) if force.local else force(start, here.stop)[here.start - start :]
+            since = start if force.memory is None else here.start
+            found += force(since, here.stop)[here.start - since :]
         return found
 
     def solved(start: int, stop: int, piece: int) -> tuple[np.ndarray, np.ndarray] | None:
