@@ -14,12 +14,13 @@ whose displacement is q_c.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from avis_ctrl.identification.response import N_Q, ResponseModel
+from avis_ctrl.identification.response import N_Q, ResponseModel, central_differences
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import point_map
 
@@ -165,6 +166,43 @@ def mount_geometry(rig: Rig) -> MountGeometry:
     _geometry.append((rig, found))
     del _geometry[:-8]
     return found
+
+
+_slopes: list[tuple[Rig, tuple[str, ...], MountSlopes]] = []
+
+
+@dataclass(frozen=True, eq=False)
+class MountSlopes:
+    """Derivatives of the rows of `MountGeometry`, payload and chassis (p, n_g, 6), by the parameters `rows` (p,)."""
+
+    rows: np.ndarray
+    payload: np.ndarray
+    chassis: np.ndarray
+
+    @staticmethod
+    def of(rig: Rig, names: Sequence[str]) -> MountSlopes:
+        """By those of the named parameters that move a mount. The rows are linear in places, so that the derivatives of
+        one rig are those of all rigs of its structure; they are cached for the most recent rigs."""
+        names = tuple(names)
+        for known, own, found in _slopes:
+            if known is rig and own == names:
+                return found
+        of_rig = [k for k, name in enumerate(names) if name in rig.parameters()]
+        slopes = [central_differences(_rows, rig, names[k]) for k in of_rig]
+        moving = [j for j, (payload, chassis) in enumerate(slopes) if np.any(payload) or np.any(chassis)]
+        shape = (len(moving), *mount_geometry(rig).payload.shape)
+        found = MountSlopes(
+            np.array(of_rig, int)[moving],
+            *(np.array([slopes[j][end] for j in moving]).reshape(shape) for end in (0, 1)),
+        )
+        _slopes.append((rig, names, found))
+        del _slopes[:-8]
+        return found
+
+
+def _rows(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    mounts = MountGeometry.of(rig)
+    return mounts.payload, mounts.chassis
 
 
 class Assembled:

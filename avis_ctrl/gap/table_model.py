@@ -11,7 +11,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Table
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.operators import Assembled, Operators
+from avis_ctrl.gap.operators import Assembled, MountSlopes, Operators, mount_geometry
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, kept_lines
@@ -210,10 +210,25 @@ class TableModel(Table):
 
     @cached_property
     def derivative_matrices(self) -> Matrices:
-        """Derivatives with respect to the rig's free parameters; zero for stiffness and damping of mounts, which
-        effects may change."""
+        """Derivatives of the matrices without mounts, which effects may change, with respect to the rig's free
+        parameters."""
         others = np.array([not MOUNT.fullmatch(name) for name in self.base.names], bool)
-        return Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
+        found = Matrices(*(slopes * others[:, None, None] for slopes in self.effective.derivative_matrices))
+        mounts, places = mount_geometry(self.effective.rig), self.mount_slopes
+        G, G_c = mounts.payload, mounts.chassis
+        for values, by_payload, by_floor in (
+            (mounts.stiffness[:, None], found.K, found.K_floor),
+            (mounts.damping[:, None], found.C, found.C_floor),
+        ):
+            for row, dG, dG_c in zip(places.rows, places.payload, places.chassis, strict=True):
+                by_payload[row] -= dG.T @ (values * G) + G.T @ (values * dG)
+                by_floor[row] -= dG.T @ (values * G_c) + G.T @ (values * dG_c)
+        return found
+
+    @cached_property
+    def mount_slopes(self) -> MountSlopes:
+        """Derivatives of the mounts' geometry with respect to the rig's free parameters."""
+        return MountSlopes.of((self.nominal or self.base).rig, self.base.names)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -330,7 +345,7 @@ class TableModel(Table):
         response = TableResponse(made, self.acting(U, block, inner))
         if not derivative:
             return Driven(response.Y, np.empty(0))
-        dY = response.by_rig(self.effective, self.derivative_matrices, len(self._free))
+        dY = response.by_rig(self.effective, self.derivative_matrices, self.mount_slopes, len(self._free))
         self._by_effects(omega, block, made, response, dY)
         return Driven(response.Y, dY)
 

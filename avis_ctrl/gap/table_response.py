@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.operators import Assembled
+from avis_ctrl.gap.operators import Assembled, MountSlopes
 from avis_ctrl.identification.response import AMPLIFIERS, N_Q, Matrices, Operands, ResponseModel
 
 # Parameter names of mount stiffnesses and dampings.
@@ -99,9 +99,9 @@ class TableResponse(DrivenTable):
         """(n, n_y, n_q) y per force on the coordinates."""
         return self.made.left
 
-    def by_rig(self, model: ResponseModel, d: Matrices, more: int) -> np.ndarray:
+    def by_rig(self, model: ResponseModel, d: Matrices, places: MountSlopes, more: int) -> np.ndarray:
         """(n_p + more, n, n_y, m) derivative with respect to the rig's free parameters, followed by zeros; d :
-        derivatives of the matrices, zero for stiffness and damping of mounts."""
+        derivatives of the matrices without mounts; places : of the mounts' geometry."""
         if "loop_delay_s" in model.names:
             raise InputError(
                 "expected the effect loop_delay in the place of this parameter",
@@ -161,4 +161,9 @@ class TableResponse(DrivenTable):
             else:
                 push = s * ops.damping_factor[:, k, None] * (moved[:, k] - own[:, k])
             dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
+        q, chassis = self.x[:, :N_Q], made.chassis(self.x, self.w, self.acting.inner)
+        pull = made.z_pf[:, :, None] * moved - made.z_pp[:, :, None] * own
+        for row, payload, base in zip(places.rows, places.payload, places.chassis, strict=True):
+            push = made.z_pf[:, :, None] * (base @ chassis) - made.z_pp[:, :, None] * (payload @ q)
+            dY[row] += per_force[:, :, :N_Q] @ (payload.T @ pull) + through @ push
         return dY

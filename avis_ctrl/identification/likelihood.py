@@ -18,7 +18,7 @@ from scipy.linalg import solve_triangular
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
-from avis_ctrl.identification.maximum_likelihood import block_residual, price_of_transient
+from avis_ctrl.identification.maximum_likelihood import Transient, block_residual, price_of_transient
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
@@ -177,6 +177,7 @@ class _Expansion:
     model: Any
     z: np.ndarray
     now: Evaluated
+    transients: Sequence[Transient]
     H: np.ndarray
     g: np.ndarray
     cost: float
@@ -187,7 +188,7 @@ class _Expansion:
 
 
 def descent(
-    expand: Callable[[np.ndarray, bool], _Expansion],
+    expand: Callable[[np.ndarray, bool, _Expansion | None], _Expansion],
     z: np.ndarray,
     priors: Priors,
     iterations: int,
@@ -196,8 +197,9 @@ def descent(
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and the number of
     steps.
 
-    expand : expansion at z, and whether with the derivative; without it, only the sum of squares is needed. Raises
-        InputError if no rig has these values.
+    expand : expansion at z; whether with the derivative, without which only the sum of squares is needed; and the
+        expansion whose transients it keeps, which change little in a small step, or None. Raises InputError if no rig
+        has these values.
 
     All parameters stay within their bounds; with a parameter at its bound, the remaining ones still reach their
     optimum.
@@ -207,17 +209,19 @@ def descent(
     Shortening the step as a whole hardly corrects this, and leads to ever shorter steps.
     """
     needed, bounds = 0.0, priors.bounds
-    at = expand(np.clip(z, *bounds), True)
+    at = expand(np.clip(z, *bounds), True, None)
     for steps in range(iterations):
         undamped = _bounded_step(at, 0.0, bounds)
-        if (undamped - at.z) @ (at.g - at.z) < settings.converged * len(at.now.e):
+        expected = (undamped - at.z) @ (at.g - at.z)
+        if expected < settings.converged * len(at.now.e):
             return at, steps
+        near = at if expected < settings.settled else None
         for damping in _dampings(at.H, needed, settings):
             z = priors.stepped(at.z, _bounded_step(at, damping, bounds) if damping else undamped)
             try:
                 # For a step that may be rejected, the derivative is not needed yet.
-                if not (damping or needed) or expand(z, False).whole < at.whole:
-                    after = expand(z, True)
+                if not (damping or needed) or expand(z, False, at).whole < at.whole:
+                    after = expand(z, True, near)
                     if after.whole < at.whole:
                         at, needed = after, damping
                         break
@@ -252,10 +256,12 @@ def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.n
 
 
 def _dampings(H: np.ndarray, last: float, settings: FitSettings) -> Iterator[float]:
-    """Dampings to try: none; then increasing from somewhat below the last one needed, until almost nothing of a
+    """Dampings to try, increasing from somewhat below the last one needed, or from none, until almost nothing of a
     Gauss-Newton step remains."""
-    yield 0.0
-    damping, most = max(last / settings.damping**2, 1.0), (1 + np.linalg.norm(H, 2)) / settings.shortest_step
+    damping, most = last / settings.damping**2, (1 + np.linalg.norm(H, 2)) / settings.shortest_step
+    if damping < 1:
+        yield 0.0
+        damping = 1.0
     while damping < most:
         yield damping
         damping *= settings.damping
@@ -275,10 +281,11 @@ def fit(
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
-        def expand(z: np.ndarray, derivative: bool, model: Any = model, weights: Weights = weights) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool, near: _Expansion | None, weights: Weights = weights) -> _Expansion:
             moved = model.at(priors.values(z))
-            now = _evaluate(moved, priors, z, data, weights, derivative)
-            return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
+            transients = near.transients if near else _transients(moved, data, weights)
+            now = _evaluate(moved, priors, z, data, weights, transients, derivative)
+            return _Expansion(moved, z, now, transients, *weights.normal_equations(now.J, now.e))
 
         at, more = descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
@@ -378,13 +385,14 @@ class Profile:
         rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
 
-        def expand(z: np.ndarray, derivative: bool) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool, near: _Expansion | None) -> _Expansion:
             moved = model.at(priors.values(z))
-            now = _evaluate(moved, priors, z, self.data, weights, derivative)
+            transients = near.transients if near else _transients(moved, self.data, weights)
+            now = _evaluate(moved, priors, z, self.data, weights, transients, derivative)
             # The products of the rows that `free` would return.
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e) :] @ rest
-            return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
+            return _Expansion(moved, z, now, transients, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
 
         end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
@@ -404,7 +412,8 @@ def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tupl
     """Weights and (N,) residual of records that were not fitted, as `Fitted.weights` and `Fitted.e`."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
-    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
+    transients = _transients(fitted.model, data, weights)
+    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, transients, derivative=False)
     return weights, weights.flatten(own.e[None])[0]
 
 
@@ -415,12 +424,22 @@ def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
     }
 
 
+def _transients(model: Any, data: Data, weights: Weights) -> list[Transient]:
+    return [Transient.of(model, block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True)]
+
+
 def _evaluate(
-    model: Any, priors: Priors, z: np.ndarray, data: Data, weights: Weights, derivative: bool = True
+    model: Any,
+    priors: Priors,
+    z: np.ndarray,
+    data: Data,
+    weights: Weights,
+    transients: Sequence[Transient],
+    derivative: bool = True,
 ) -> Evaluated:
     parts = [
-        block_residual(model, block, L[:, None], derivative=derivative)
-        for block, L in zip(data.blocks, weights.L, strict=True)
+        transient.residual(model, block, L[:, None], derivative=derivative)
+        for transient, block, L in zip(transients, data.blocks, weights.L, strict=True)
     ]
     e = np.concatenate([one[0] for one in parts])
     J = np.empty((len(z) if derivative else 0, len(e)))
@@ -428,4 +447,4 @@ def _evaluate(
     for own, rows, _ in parts if derivative else ():
         np.multiply(rows, slopes, out=J[:, start : start + len(own)])
         start += len(own)
-    return Evaluated(e, J, [one[2].error[:, :, 0] for one in parts])
+    return Evaluated(e, J, [left for _, _, left in parts])

@@ -377,6 +377,47 @@ def block_residual(
     return e, J, Residual(block, plain, error, white / np.sqrt(2))
 
 
+@dataclass(frozen=True, eq=False)
+class Transient:
+    """Transient of a block during a fit: that of known initial values, which changes with the model, and Q (N, r),
+    whitened, a basis of all others, which are projected out.
+
+    body, inner : initial values as in `transient_parts`; None for a block without a transient.
+
+    The gradient is exact, also if residuals have other weights than those of the projection; that of `block_residual`
+    is exact with its own weights only, because it leaves out how the basis changes (L. Kaufman, BIT 15 (1975) 49-57).
+    """
+
+    Q: np.ndarray
+    body: np.ndarray | None
+    inner: np.ndarray | None
+
+    @staticmethod
+    def of(model: FrequencyModel, block: SpectralBlock, L: np.ndarray) -> Transient:
+        """The transient at a model: its most likely initial values."""
+        if not block.transient:
+            return Transient(np.zeros((0, 0)), None, None)
+        _, norms, Q, X = whitened_transient(model, block, L)
+        e = as_real(whitened(L, block.Y - model.answer(block, None, False).Y)[None])[0]
+        return Transient(Q, *transient_parts(X @ (Q.T @ e), norms, block, model))
+
+    def residual(
+        self, model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """e (N,) and J (n_p, N) as `block_residual`, and the residual (n, n_y) in the unit of y."""
+        inner = {} if self.inner is None else {"inner": self.inner}
+        found = model.answer(block, self.body, derivative, **inner)
+        white = whitened(L, block.Y - found.Y)
+        e = as_real(white[None])[0]
+        J = whitened_real(L, found.dY) if derivative else np.empty(0)
+        if self.Q.size:
+            e -= self.Q @ (self.Q.T @ e)
+            if derivative:
+                J -= (self.Q @ (self.Q.T @ J.T)).T  # parameters come last in memory
+            white = (e[: len(e) // 2] + 1j * e[len(e) // 2 :]).reshape(white.shape)
+        return e, J, np.linalg.solve(L[:, 0], white)[:, :, 0]
+
+
 def whitened_transient(
     model: FrequencyModel, block: SpectralBlock, L: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -83,23 +83,34 @@ class Priors:
         sigma[rows] *= factor
         return replace(self, sigma=sigma)
 
+    @cached_property
+    def _adds(self) -> np.ndarray:
+        """(n,) positive parameters that act as sums: masses, stiffnesses and dampings, but not gains."""
+        return self.positive & np.array([not name.startswith(_GAINS) for name in self.names], bool)
+
     def stepped(self, z: np.ndarray, end: np.ndarray) -> np.ndarray:
         """(n,) standardised values whose parameters have moved as they would to first order from z to `end`.
 
-        Masses, stiffnesses and dampings add up, their logarithms do not: where the data determine a sum of dampings but
-        not each of them, equal and opposite steps of two logarithms change the sum, and a fit of z proceeds by ever
-        shorter steps. A positive parameter that would lose more than half of its value moves less.
+        A gain multiplies others, so that its logarithm moves. Masses, stiffnesses and dampings add up: where the data
+        determine a sum of dampings but not each of them, equal and opposite steps of two logarithms change the sum, and
+        a fit proceeds by ever shorter steps. Such a parameter moves itself, by less if it would lose more than half of
+        its value.
         """
-        sigma = np.where(self.positive, self.sigma, 1.0)
-        change = sigma * (end - z)
+        low, high = self.bounds
+        # A step that ends at a bound ends there exactly.
+        moving = self._adds & (end > low) & (end < high)
+        sigma = np.where(moving, self.sigma, 1.0)
+        change = np.where(moving, sigma * (end - z), 0.0)
         moved = np.where(change > -0.5, np.log1p(np.maximum(change, -0.5)), np.log(0.5) + 2 * (change + 0.5))
-        return np.clip(np.where(self.positive & np.isfinite(change), z + moved / sigma, end), *self.bounds)
+        return np.clip(np.where(moving, z + moved / sigma, end), low, high)
 
     def slopes(self, z: np.ndarray) -> np.ndarray:
         """(n,) derivative of the values by z."""
         return np.where(self.positive, self.sigma * self.values(z), self.sigma)
 
 
+# Start of the names of gains.
+_GAINS = ("sensor.", "actuator.")
 _FIELDS = ("mean", "sigma", "positive", "low", "high")
 
 

@@ -181,7 +181,7 @@ def test_a_step_within_bounds_is_that_of_bounded_least_squares(bounded, rng):
         names = tuple("abcdefgh")
         priors = Priors(names, np.zeros(8), np.ones(8), np.zeros(8, bool), low, np.full(8, np.inf))
 
-        def expand(z, derivative=True, root=root, target=target):
+        def expand(z, derivative, near, root=root, target=target):
             e = target - root @ z
             return SimpleNamespace(
                 z=z, H=root.T @ root, g=root.T @ e, whole=float(e @ e + z @ z), now=SimpleNamespace(e=e)
