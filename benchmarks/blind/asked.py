@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from benchmarks.blind.figures import of_kind, right_places
-from benchmarks.blind.judge import Judged
+from benchmarks.blind.judge import Judged, matches
 from benchmarks.blind.parameters import parameter_errors
 from benchmarks.blind.rates import Share
 from benchmarks.blind.tables import Table
@@ -52,6 +52,7 @@ def figures(cases: Sequence[Judged]) -> list[tuple[str, ...]]:
         ),
         ("right place, where the effect has one and its name is right", str(right_places(cases)), "97 %", "90 %"),
         ("two effects: both named", fraction(map(both_named, two)), "85 %", "70 %"),
+        ("two effects: both named, as effects or as traces", fraction(map(both_listed, two))),
         ("two effects, each clear or gross: both named", fraction(both_named(case) for case in two if case.line.clear)),
         (
             "outside the library: named as something else",
@@ -86,6 +87,12 @@ def figures(cases: Sequence[Judged]) -> list[tuple[str, ...]]:
 
 def both_named(case: Judged) -> bool:
     return len(case.pairs) == 2
+
+
+def both_listed(case: Judged) -> bool:
+    """Both hidden effects are listed, one of them perhaps as a trace, because it explains little of the gap."""
+    answer = case.line.answer
+    return answer is not None and len(matches(case.line.hidden, [*answer.effects, *answer.traces])) == 2
 
 
 def closes_the_gap(case: Judged) -> bool:

@@ -97,6 +97,7 @@ class Answer(BaseModel):
     version: Literal[1]
     verdict: Literal["none", "explained", "partly explained", "unexplained"]
     effects: list[Named]
+    traces: list[Named] = []
     gap: list[Stage]
     where: list[Place]
     next_experiment: str | None

@@ -37,8 +37,9 @@ def named(name, location="payload", probability=0.99, group=(), **parameters):
     }
 
 
-def answer(verdict, *effects, nrmse=(0.2, 0.01), chi2=1.0):
+def answer(verdict, *effects, nrmse=(0.2, 0.01), chi2=1.0, traces=()):
     return {
+        "traces": list(traces),
         "format": "avis-gap",
         "version": 1,
         "verdict": verdict,
@@ -260,6 +261,18 @@ def test_asked_figures_by_hand():
     }.items():
         assert found[what]["clean"].startswith(fraction), what
     assert found["two effects: both named"]["asked"] == "85 %"
+
+
+def test_a_second_effect_that_explains_little_may_be_listed_as_a_trace():
+    lag, corner = hidden("actuator_lag", "actuators"), hidden("geophone_corner", "Sz2", corner_Hz=5.0)
+    first, second = named("actuator_lag", "actuators"), named("geophone_corner", "Sz2", corner_Hz=(5.0, 0.01))
+    lines = [
+        line(0, "two", [lag, corner], answer("explained", first, traces=[second])),
+        line(1, "two", [lag, corner], answer("explained", first)),
+    ]
+    found = {row[0]: row[1] for row in asked_table(list(map(judge, lines))).rows}
+    assert found["two effects: both named"].startswith("0.0 % (0/2;")
+    assert found["two effects: both named, as effects or as traces"].startswith("50.0 % (1/2;")
 
 
 @pytest.mark.parametrize(

@@ -37,16 +37,19 @@ def line(
     probability: float = 0.95,
     verdict: str = "explained",
 ) -> Line:
-    effects = [
-        {
-            "name": name,
-            "location": "payload",
-            "parameters": {},
-            "probability": probability,
-            "indistinguishable_from": [],
-        }
-        for name in named
-    ]
+    effects, traces = (
+        [
+            {
+                "name": name,
+                "location": "payload",
+                "parameters": {},
+                "probability": probability,
+                "indistinguishable_from": [],
+            }
+            for name in some
+        ]
+        for some in (named, ("loop_delay",))
+    )
     answer = {
         "format": "avis-gap",
         "version": 1,
@@ -56,7 +59,7 @@ def line(
         "where": [],
         "next_experiment": None,
         "seconds": 1.0,
-        "traces": [{"name": "loop_delay"}],
+        "traces": traces,
     }
     return Line.model_validate(
         {
