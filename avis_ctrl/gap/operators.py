@@ -295,18 +295,37 @@ class Assembled:
             return np.concatenate([force, np.zeros((n, self.n_q - N_Q, force.shape[2]))], axis=1)
 
         F = [np.broadcast_to(np.eye(self.n_q)[None, :, N_Q:], (n, self.n_q, self.n_q - N_Q)).astype(complex)]
-        inside = np.flatnonzero(np.isfinite(ops.internal_omega))
+        inside, by_mass = self._masses_inside
         if inside.size:
-            w, share = ops.internal_omega[inside], ops.payload_share[inside]
-            g = np.broadcast_to(ops.stiffness_factor, self.z_pp.shape)[:, inside]
-            g = g + 2 * ops.internal_damping[inside] * ops.s[:, None] / w
-            by_mass = g * (1 - share) / (g + (ops.s[:, None] / w) ** 2)
             F.append(self.G.T[:, inside] * by_mass[:, None, :])
         if ops.recoil is not None:
             F.append(self.G.T @ (self.z_pf[:, :, None] * (ops.mounts.chassis @ self._moves)))
         F += [of_body(one) for one in ops.inner]
         impulses = np.concatenate(F, axis=2)
         return np.concatenate([impulses, ops.s[:, None, None] * impulses, *map(of_body, ops.decays)], axis=2)
+
+    @cached_property
+    def _masses_inside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices (i,) of mounts with a mass inside, and (n, i) force on the payload per impulse on that mass."""
+        ops = self.ops
+        inside = np.flatnonzero(np.isfinite(ops.internal_omega))
+        w, share, s = ops.internal_omega[inside], ops.payload_share[inside], ops.s[:, None]
+        g = np.broadcast_to(ops.stiffness_factor, self.z_pp.shape)[:, inside] + 2 * ops.internal_damping[inside] * s / w
+        return inside, g * (1 - share) / (g + (s / w) ** 2)
+
+    def push_of_masses_inside(self, inner: np.ndarray) -> np.ndarray:
+        """(n, n_g, 1) force of the mounts on the payload due to the initial states of the masses inside them
+        (`forces_of_states`)."""
+        inside, by_mass = self._masses_inside
+        first = self.n_q - N_Q
+        impulse, step = (inner[k + first : k + first + len(inside)] for k in (0, self._impulses(inner)))
+        found = np.zeros((len(by_mass), len(self.G), 1), complex)
+        found[:, inside, 0] = by_mass * (impulse + self.ops.s[:, None] * step)
+        return found
+
+    def _impulses(self, inner: np.ndarray) -> int:
+        """Number of impulses, and of steps, among the initial states of `forces_of_states`."""
+        return (len(inner) - sum(one.shape[2] for one in self.ops.decays)) // 2
 
     @property
     def _moves(self) -> np.ndarray:
@@ -317,8 +336,7 @@ class Assembled:
     def _chassis_states(self, inner: np.ndarray) -> np.ndarray:
         """(n, 6, 1) chassis displacement due to the chassis' own part of the initial states of `forces_of_states`."""
         ops, moves = self.ops, self._moves
-        n_decays = sum(one.shape[2] for one in ops.decays)
-        n_impulses = (len(inner) - n_decays) // 2
+        n_impulses = self._impulses(inner)
         first = n_impulses - sum(one.shape[2] for one in ops.inner) - moves.shape[2]
         own = slice(first, first + moves.shape[2])
         return (moves @ inner[:n_impulses][own])[:, :, None] + ops.s[:, None, None] * (moves @ inner[n_impulses:][own])[

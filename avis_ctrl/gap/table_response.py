@@ -163,6 +163,8 @@ class TableResponse(DrivenTable):
             dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
         q, chassis = self.x[:, :N_Q], made.chassis(self.x, self.w, self.acting.inner)
         pull = made.z_pf[:, :, None] * moved - made.z_pp[:, :, None] * own
+        if self.acting.inner is not None and self.acting.inner.size:
+            pull = pull + made.push_of_masses_inside(self.acting.inner)
         for row, payload, base in zip(places.rows, places.payload, places.chassis, strict=True):
             push = made.z_pf[:, :, None] * (base @ chassis) - made.z_pp[:, :, None] * (payload @ q)
             dY[row] += per_force[:, :, :N_Q] @ (payload.T @ pull) + through @ push

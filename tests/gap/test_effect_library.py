@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assembled_table import Assembly, chain, mount_map
+from numpy.testing import assert_allclose
 
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import drifted
@@ -532,6 +533,38 @@ def test_derivatives_by_central_differences(name, place):
         passing = np.mean(np.abs(volts - 1.0) < 1e-3) / np.mean(volts > 1.0)
         most = 1e-6 if row < len(BARE.names) else passing if name == "actuator_saturation" else 1e-5
         assert np.linalg.norm(found.dY[row] - true) <= most * np.linalg.norm(true), model.names[row]
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        (name, place)
+        for name, place in EVERYWHERE
+        if name
+        in (
+            "mount_surge",
+            "structural_damping",
+            "mount_relaxation",
+            "base_compliance",
+            "payload_flexible_mode",
+            "leveling_loop",
+        )
+    ],
+)
+def test_derivatives_by_places_of_mounts_that_effects_have_changed(name, place):
+    """With initial values of modes and masses, which the mounts transmit, too; against differences. First-order states
+    of an effect start at zero: it defines their force on the payload itself."""
+    free = TableModel(ResponseModel.of(RIG, ("isolator2.p_x", "isolator2.p_y", "isolator3.p_z")))
+    model = with_effect(name, place, values_at(name, place), free)
+    inner = np.random.default_rng(4).standard_normal(model.inner_transients(OMEGA[:1]).shape[2])
+    decays = sum(one.shape[2] for one in model.operators(OMEGA).decays)
+    inner[len(inner) - decays :] = 0
+    theta, found = model.values, model.answer(BLOCK, inner=inner).dY
+    for row in range(3):
+        h = 1e-4 * np.eye(len(theta))[row]
+        sides = [model.at(theta + end).answer(BLOCK, None, False, inner).Y for end in (h, -h)]
+        slope = (sides[0] - sides[1]) / 2e-4
+        assert_allclose(found[row], slope, atol=1e-5 * np.max(np.abs(slope)))
 
 
 def test_a_block_without_its_record_is_refused():

@@ -24,7 +24,13 @@ from avis_ctrl.gap.validation import by_information, halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
-from avis_ctrl.identification.maximum_likelihood import price_of_transient, transient_unknowns, whitened
+from avis_ctrl.identification.maximum_likelihood import (
+    Transient,
+    block_residual,
+    price_of_transient,
+    transient_unknowns,
+    whitened,
+)
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import Priors, beside, identified, re_identified, with_tolerances
 from avis_ctrl.identification.response import ResponseModel
@@ -95,6 +101,56 @@ def test_every_tolerance_of_the_contract_is_free():
     assert_allclose(priors.z(priors.values(z)), z, atol=1e-9)
     by_difference = (priors.values(z + 1e-6) - priors.values(z - 1e-6)) / 2e-6
     assert_allclose(priors.slopes(z), by_difference, rtol=1e-6)
+
+
+def test_a_step_keeps_sums_of_dampings_and_products_of_gains():
+    """Two dampings whose sum the data know, and two gains whose product they know."""
+    names = ("isolator1.c_x", "isolator2.c_x", "sensor.Sz1", "actuator.Az1")
+    priors = Priors(names, np.array([40.0, 40.0, 28.0, 1.5]), np.array([0.2, 0.2, 0.02, 0.02]), np.ones(4, bool))
+    start = np.array([0.5, -1.0, 1.0, 2.0])
+    before, slopes = priors.values(start), priors.slopes(start)
+    along = np.array([1.0, -slopes[0] / slopes[1], 0.0, 0.0]), np.array([0.0, 0.0, 1.0, -1.0])
+    after = priors.values(priors.stepped(start, start + along[0] + 3 * along[1]))
+    assert after[0] + after[1] == pytest.approx(before[0] + before[1], rel=1e-12)
+    assert after[2] * after[3] == pytest.approx(before[2] * before[3], rel=1e-12)
+    assert abs(after[0] - before[0] - slopes[0]) < 1e-9
+    # However long a step is, a damping remains positive, and a longer step moves it farther.
+    ends = [priors.values(priors.stepped(start, start - x * along[0]))[0] for x in (1.0, 2.4, 2.6, 30.0)]
+    assert np.all(np.diff(ends) < 0) and ends[-1] > 0
+
+
+def test_a_step_to_a_bound_ends_there():
+    priors = Priors(("isolator1.c_x",), np.array([40.0]), np.array([0.2]), np.ones(1, bool), 0.0, 44.0)
+    assert priors.values(priors.stepped(np.zeros(1), priors.bounds[1])) == 44.0
+
+
+def test_the_gradient_is_exact_with_path_errors():
+    """Of the penalised sum of squares with a fixed basis of the transient, by parameters far from their optimum;
+    against differences."""
+    settings = GapSettings()
+    names = ("isolator1.c_z", "isolator2.p_x", "sensor.Sz1", "mass", "J13")
+    model = bare(names)
+    one = replace(block(bare(), 3, 40, 1e-5), Y=block(bare(), 3, 40, 1e-5).Y * 1.01)
+    data = Data((one,), (0.2,))
+    paths = [path_contributions(model, one)]
+    weights = weigh(data.blocks, data.levels, paths, first_variances(data, settings), settings)
+    L = weights.L[0][:, None]
+    transient, scale = Transient.of(model, one, L), 1e-3 * np.abs(model.scales())
+
+    def cost(theta):
+        e = transient.residual(model.at(theta), one, L, derivative=False)[0]
+        return weights.normal_equations(np.empty((0, len(e))), e)[2]
+
+    e, J, left = transient.residual(model, one, L, derivative=True)
+    _, g, _ = weights.normal_equations(J, e)
+    for k, h in enumerate(np.diag(scale)):
+        slope = (cost(model.values + h) - cost(model.values - h)) / (2 * scale[k])
+        assert -2 * g[k] == pytest.approx(slope, rel=1e-3, abs=1e-5 * np.linalg.norm(J[k]) * np.linalg.norm(e))
+    # At the model itself, residual and Jacobian are those of the projection that follows the parameters.
+    e_following, J_following, found = block_residual(model, one, L, derivative=True)
+    assert_allclose(e, e_following, atol=1e-9 * np.linalg.norm(e))
+    assert_allclose(J, J_following, atol=1e-9 * np.linalg.norm(J))
+    assert_allclose(left, found.error[:, :, 0], atol=1e-9 * np.linalg.norm(left))
 
 
 def test_path_errors_are_integrated_out_as_a_dense_covariance_would_do():
