@@ -276,13 +276,13 @@ def fit(
     would explain at once what the parameters explain after a few more steps.
     """
     steps, best, noise, released = 0, None, mean_noise(data.blocks, data.levels, settings), False
-    model = model.at(priors.values(z))
+    begun = model = model.at(priors.values(z))
     for k in range(settings.rounds + 1):
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
         def expand(z: np.ndarray, derivative: bool, near: _Expansion | None, weights: Weights = weights) -> _Expansion:
-            moved = model.at(priors.values(z))
+            moved = begun.at(priors.values(z))
             transients = near.transients if near else _transients(moved, data, weights)
             now = _evaluate(moved, priors, z, data, weights, transients, derivative)
             return _Expansion(moved, z, now, transients, *weights.normal_equations(now.J, now.e))
