@@ -134,6 +134,11 @@ class Finding:
     limit: float | None = None
     picture: Picture | None = None
 
+    @property
+    def tested(self) -> bool:
+        """Whether the records could show what the gate looks for: a passed test has a number or a limit."""
+        return self.severity != "ok" or self.value is not None or self.limit is not None
+
     def __post_init__(self) -> None:
         for field_ in ("value", "limit"):
             if getattr(self, field_) is not None:

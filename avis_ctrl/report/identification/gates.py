@@ -14,6 +14,7 @@ from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section,
 from avis_ctrl.report.settings import SETTINGS
 
 MARKS: dict[str, Cell] = {
+    "not tested": "not tested",
     "ok": Mark("ok", True),
     "note": "note",
     "warning": Mark("WARNING", False),
@@ -31,11 +32,16 @@ def gates(findings: Sequence[Finding]) -> Section:
     together = _together(ordered)
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
-    counts = ", ".join(f"{n} {s}{'s' * (n > 1 and s != 'ok')}" for s in reversed(SEVERITIES) if (n := listed.count(s)))
+    counts = ", ".join(
+        f"{n} {s}{'s' * (n > 1 and s in ('note', 'warning', 'stop'))}"
+        for s in (*reversed(SEVERITIES), "not tested")
+        if (n := listed.count(s))
+    )
     pieces: list[Piece] = [
         table(
             f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
-            "note is for information, a warning means less accurate results, a stop means wrong results.",
+            "note is for information, a warning means less accurate results, a stop means wrong results. A gate is not "
+            "tested if no record can show what it looks for.",
             ("gate", "severity", "finding"),
             rows,
             "lcl",
@@ -57,11 +63,12 @@ def warnings(findings: Sequence[Finding]) -> list[str]:
 
 
 def _together(findings: Sequence[Finding]) -> list[tuple[str, str, str]]:
-    """(gate, severity, text), findings that differ only in their first sentence merged."""
+    """(gate, severity or "not tested", text), findings that differ only in their first sentence merged."""
     grouped: dict[tuple[str, str, str], list[str]] = {}
     for f in findings:
         first, _, rest = f.sentence.partition(". ")
-        grouped.setdefault((f.gate, f.severity, rest), []).append(first.rstrip("."))
+        mark = f.severity if f.tested else "not tested"
+        grouped.setdefault((f.gate, mark, rest), []).append(first.rstrip("."))
     return [
         (gate, severity, f"{'; '.join(firsts)}. {rest}".rstrip()) for (gate, severity, rest), firsts in grouped.items()
     ]
