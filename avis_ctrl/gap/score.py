@@ -133,9 +133,15 @@ class Part:
             out -= (self.transient @ (self.transient.T @ out.T)).T
         return out
 
-    def side(self, model: TableModel) -> AtMotion:
-        """A nearby model at the motion of this model."""
-        return AtMotion(Assembled(model.operators(self.block.omega)), self._acting(model), self.response.x)
+    def change(self, effect: ActiveEffect) -> np.ndarray:
+        """(n, n_y, m) change of y by an effect, to first order."""
+        response = self.response
+        if effect.effect.nonlinear:
+            side = AtMotion(self.made, self.model.contribution(effect, self.block), np.zeros_like(response.x))
+            return side.Y + response.left @ side.push
+        changed = Assembled(self.model.with_effect(effect).operators(self.block.omega))
+        side = AtMotion(changed, response.acting, response.x)
+        return side.Y - response.Y + response.left @ side.push
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y per symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
@@ -205,21 +211,13 @@ class Score:
         if not linear:
             added = self.model.with_effect(effect)
             return [(added.answer(part.block, part.body, False).Y - part.response.Y)[None] for part in self.parts]
-        models = []
+        stepped = []
         for j in linear:
             values = list(effect.values)
             step = SETTINGS.step * effect.parameters[j].size
             values[j] += step
-            models.append((self.model.with_effect(effect.at(values)), step))
-        columns = []
-        for part in self.parts:
-            rest = part.response.Y
-            own = []
-            for model, step in models:
-                side = part.side(model)
-                own.append((side.Y - rest + part.response.left @ side.push) / step)
-            columns.append(np.array(own))
-        return columns
+            stepped.append((effect.at(values), step))
+        return [np.array([part.change(one) / step for one, step in stepped]) for part in self.parts]
 
     def reduction(self, A: np.ndarray) -> Reduction:
         """Reduction of chi2 by directions (k, N)."""

@@ -365,6 +365,17 @@ class TableModel(Table):
             U[:, : len(self.actuators)] += volts
         return Acting(U, len(self.actuators), force, reading, output, inner)
 
+    def contribution(self, one: ActiveEffect, block: SpectralBlock) -> Acting:
+        """Inputs and outputs of a record that an effect adds, if it depends on the record, without all others."""
+        return self._alone(block.omega, _added(one, self.motion[block.name], block.omega))
+
+    def _alone(self, omega: np.ndarray, added: Added) -> Acting:
+        volts, *rest = added
+        U = np.zeros((len(omega), len(self.inputs), 1), complex)
+        if volts is not None:
+            U[:, : len(self.actuators)] = volts
+        return Acting(U, len(self.actuators), *rest)
+
     def _by_effects(
         self, omega: np.ndarray, block: SpectralBlock | None, made: Assembled, response: TableResponse, dY: np.ndarray
     ) -> None:
@@ -377,13 +388,10 @@ class TableModel(Table):
                 assert block is not None
                 record = self.motion[block.name]
                 up, down = (_added(other, record, omega) for other in others)
-                volts, *rest = (
-                    None if a is None or b is None else (a - b) / width for a, b in zip(up, down, strict=True)
+                slope = Added(
+                    *(None if a is None or b is None else (a - b) / width for a, b in zip(up, down, strict=True))
                 )
-                change = np.zeros((len(omega), len(self.inputs), 1), complex)
-                if volts is not None:
-                    change[:, : len(self.actuators)] = volts
-                side = AtMotion(made, Acting(change, len(self.actuators), *rest), np.zeros_like(response.x))
+                side = AtMotion(made, self._alone(omega, slope), np.zeros_like(response.x))
                 dY[row] = side.Y + response.left @ side.push
                 continue
             sides = [AtMotion(table, response.acting, response.x) for table in tables]
