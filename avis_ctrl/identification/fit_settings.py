@@ -39,7 +39,8 @@ class FitSettings:
     variance_settled : expected rise of the log-likelihood of one sensor in one band [nats] below which they stop.
     longest_step : maximum change of the logarithm of a variance in one step [1], a factor of twenty.
     rounds, settled : maximum number of estimates of the variances, each from the fit before it, and rise of the
-        log-likelihood [nats] below which they stop: well below what decides between two effects.
+        log-likelihood [nats] below which they stop: well below what decides between two effects. A step that is
+        expected to decrease the sum of squares by less keeps the transients of the step before.
     iterations : Gauss-Newton steps between two estimates of the variances.
     first_distortion : distortion in the first fit, relative to the square of `first_error` [1].
     least_distortion : distortion that cannot be excluded, relative to the noise [1], the scale of its prior: the
