@@ -60,6 +60,10 @@ class Formula:
     words: str
 
 
+# Length of a cell's text beyond which it wraps.
+LONG = 40
+
+
 @dataclass(frozen=True)
 class Table:
     """A table.
@@ -75,6 +79,27 @@ class Table:
     def alignment(self, column: int) -> str:
         """Alignment of a column: l, c or r."""
         return self.align[column] if column < len(self.align) else ("l" if column == 0 else "r")
+
+    @property
+    def folds(self) -> bool:
+        """Whether the table is too wide for a phone, and each row becomes a block there."""
+        return len(self.header) > (2 if any(self.wraps(cell) for row in self.rows for cell in row) else 3)
+
+    @staticmethod
+    def wraps(cell: Cell) -> bool:
+        """Whether a cell has text of more than a line."""
+        return isinstance(cell, str) and len(cell) > LONG
+
+    @property
+    def key(self) -> int:
+        """Column that distinguishes the rows best, the heading of such a block: short text, the first of equal ones."""
+        columns = list(zip(*self.rows, strict=True))
+        short = [
+            k
+            for k, cells in enumerate(columns)
+            if self.alignment(k) == "l" and all(isinstance(c, str) and not self.wraps(c) for c in cells)
+        ]
+        return max(short, key=lambda k: len(set(columns[k])), default=0)
 
 
 @dataclass(frozen=True)

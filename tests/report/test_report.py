@@ -11,7 +11,7 @@ from reading import Reader, Written, pdf_text, written
 
 from avis_ctrl.report.content import document
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Mark, Paragraph, Table
+from avis_ctrl.report.pieces import Mark, Paragraph, Table, table
 from avis_ctrl.study.design_result import Bound, DesignResult
 
 
@@ -65,6 +65,17 @@ def test_a_wide_table_folds_on_a_phone(fabricated: DesignResult, html: bytes) ->
     assert compared[0].header[1] == "mu synthesis"  # the delivered controller is not the one that is cut off
     assert labels.count("mu synthesis") == sum(len(table.rows) for table in compared)
     assert sum("folds" in (a.get("class") or "") for tag, a in page.elements if tag == "table") > 3
+
+
+def test_the_heading_of_a_folded_row_distinguishes_it() -> None:
+    """By the parameter where all rows have the same effect; never by long text, and by the first column otherwise."""
+    long = "a sentence that is longer than the line of a phone can be"
+    rows = [("lag", "actuators", f"uneven_{k}", "0.1", long) for k in range(3)]
+    assert table("", ("effect", "place", "parameter", "value", "meaning"), rows, "lllrl").key == 2
+    gates = table("", ("gate", "finding", "severity"), [("hum", long, "note"), ("spikes", long, "ok")], "llc")
+    assert gates.key == 0 and gates.folds
+    assert not table("", ("what", "value"), [("seed", long)]).folds
+    assert table("", ("a", "b", "c", "d"), [], "llll").key == 0
 
 
 def test_curves_reach_the_page_unchanged(fabricated: DesignResult, html: bytes) -> None:
