@@ -52,9 +52,9 @@ def gates(findings: Sequence[Finding]) -> Section:
         pieces.append(figure_of(f"gate_{k}", " ".join(sentences), [picture]))
     notes = [p for p, _ in _pictures([f for f in ordered if f.severity == "note"])]
     well = [p for p, _ in _pictures([f for f in ordered if f.severity == "ok"])]
-    small = shown(_small("gate_ok", "Gates without findings; limits dashed.", well))
+    small = shown(_small("gate_ok", "Gates without findings.", well))
     fold = Fold(f"The {len(well)} figures of gates without findings", small)
-    return section("Gates", "gates", pieces, _small("gate_notes", "Gates with a note; limits dashed.", notes), fold)
+    return section("Gates", "gates", pieces, _small("gate_notes", "Gates with a note.", notes), fold)
 
 
 def warnings(findings: Sequence[Finding]) -> list[str]:
@@ -91,12 +91,12 @@ def _small(name: str, caption: str, pictures: list[Picture]) -> list[Piece]:
     many = [p for p in pictures if len(p.series) > 2]
     few = [p for p in pictures if len(p.series) <= 2]
     groups = [of[k : k + SETTINGS.gate_panels] for of in (many, few) for k in range(0, len(of), SETTINGS.gate_panels)]
-    return [
-        figure_of(
-            f"{name}_{k}", caption + (f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""), group, 2, 0.75
-        )
-        for k, group in enumerate(groups)
-    ]
+    found: list[Piece] = []
+    for k, group in enumerate(groups):
+        part = f" Part {k + 1} of {len(groups)}." if len(groups) > 1 else ""
+        dashed = " Dashed lines are limits." if any(p.limits for p in group) else ""
+        found.append(figure_of(f"{name}_{k}", caption + part + dashed, group, 2, 0.75))
+    return found
 
 
 def figure_of(name: str, caption: str, pictures: Sequence[Picture], columns: int = 1, height: float = 1.0) -> Figure:
