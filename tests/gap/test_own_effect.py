@@ -172,8 +172,9 @@ def test_a_file_that_is_none(tmp_path, path):
         ("values): pass", "values): ops.sense[:] = np.nan", "place payload = [0.1]: expected a finite response"),
         ("values): pass", "values): ops.sensor('Sq9')", "line 9: ValueError"),
         (', "something"\n', "\n", "ValueError"),
+        ("    def places", "    nonlinear = True\n    def places", "change: expected no such method in an effect"),
     ],
-    ids=["name", "places", "method", "range", "size", "grid", "finite", "channel", "words"],
+    ids=["name", "places", "method", "range", "size", "grid", "finite", "channel", "words", "both"],
 )
 def test_effects_that_do_not_work_are_said_before_the_search(tmp_path, old, new, said):
     path = tmp_path / "bad.py"

@@ -93,6 +93,13 @@ def _tried(effect: Effect, model: TableModel) -> None:
     for method in ("places", "parameters"):
         if getattr(type(effect), method) is getattr(Effect, method) and not (method == "places" and effect.at):
             raise InputError("expected the method", field=method)
+    for method in ("change", "rig_changes"):
+        if effect.nonlinear and getattr(type(effect), method) is not getattr(Effect, method):
+            raise InputError(
+                "expected no such method in an effect that depends on amplitude or time; its force or volts represent "
+                "all of it",
+                field=method,
+            )
     omega = 2 * np.pi * np.array(SETTINGS.tried_Hz)
     for place in effect.places(model):
         parameters = effect.parameters(model, place)
