@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeVar
 
 from avis_ctrl.report.figures import Figure
+from avis_ctrl.report.settings import SETTINGS
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,6 @@ class Formula:
     words: str
 
 
-# Length of a cell's text beyond which it wraps.
-LONG = 40
-
-
 @dataclass(frozen=True)
 class Table:
     """A table.
@@ -88,7 +85,7 @@ class Table:
     @staticmethod
     def wraps(cell: Cell) -> bool:
         """Whether a cell has text of more than a line."""
-        return isinstance(cell, str) and len(cell) > LONG
+        return isinstance(cell, str) and len(cell) > SETTINGS.cell_letters
 
     @property
     def key(self) -> int:

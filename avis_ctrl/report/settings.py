@@ -16,6 +16,7 @@ class ReportSettings:
         candidate_parameters : the same of a rejected candidate, which has a column more.
     candidates : rejected candidates shown at once, about a page; the others are folded.
     poles : maximum number of poles of a controller, about one page.
+    cell_letters : letters of a cell beyond which its text wraps on a phone.
 
     Figures.
 
@@ -47,6 +48,7 @@ class ReportSettings:
     candidate_parameters: int = 4
     candidates: int = 12
     poles: int = 60
+    cell_letters: int = 40
     gain_dB: tuple[float, float] = (-60.0, 40.0)
     weight_Hz: tuple[float, float] = (0.1, 500.0)
     weight_points: int = 400
