@@ -3,8 +3,8 @@
     python -m benchmarks.processor_time COMMIT [--seeds 1 2 3] [--cluttered] [--duration 60]
 
 The campaigns come from the simulator in tests/truth. Each command runs on each campaign with both versions, one after
-the other and in changing order, in a process of its own with one BLAS thread. Counted are user and system time of the
-process and its children, and the largest memory of one process. Nothing else should run on the machine: a busy
+the other and in changing order, in a process of its own with one BLAS thread. The figures are user and system time of
+the process and its children, and the largest memory of one process. Nothing else should run on the machine: a busy
 neighbour raises the processor time of both.
 """
 
@@ -74,8 +74,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             ratios = _compared(args, Path(folder), {"other": other, "this": ROOT})
         finally:
             subprocess.run(["git", "-C", str(ROOT), "worktree", "remove", "--force", str(other)], check=True)
-    for command, found in ((command, found) for command, found in ratios.items() if found):
-        print(f"{command}: this over other, median {np.median(found):.2f}, largest {max(found):.2f}")
+    for command, found in ratios.items():
+        if found:
+            print(f"{command}: this over other, median {np.median(found):.2f}, largest {max(found):.2f}")
     return 0
 
 

@@ -14,9 +14,10 @@ whose displacement is q_c.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import TypeVar
 
 import numpy as np
 
@@ -154,55 +155,53 @@ class Operators:
             self.extra_floor = F if self.extra_floor is None else self.extra_floor + F
 
 
-_geometry: list[tuple[Rig, MountGeometry]] = []
+Kept = TypeVar("Kept")
 
 
-def mount_geometry(rig: Rig) -> MountGeometry:
-    """`MountGeometry.of`, cached for the most recent rigs: a fit requests the same geometry many times."""
-    for known, found in _geometry:
-        if known is rig:
-            return found
-    found = MountGeometry.of(rig)
-    _geometry.append((rig, found))
-    del _geometry[:-8]
+def for_recent_rigs(function: Callable[..., Kept]) -> Callable[..., Kept]:
+    """Keep the results for the most recent rigs and other arguments: a fit requests the same ones many times."""
+    known: list[tuple[Rig, tuple[object, ...], Kept]] = []
+
+    @wraps(function)
+    def found(rig: Rig, *others: object) -> Kept:
+        for one, own, result in known:
+            if one is rig and own == others:
+                return result
+        result = function(rig, *others)
+        known.append((rig, others, result))
+        del known[:-8]
+        return result
+
     return found
 
 
-_slopes: list[tuple[Rig, tuple[str, ...], MountSlopes]] = []
+mount_geometry = for_recent_rigs(MountGeometry.of)
 
 
 @dataclass(frozen=True, eq=False)
 class MountSlopes:
-    """Derivatives of the rows of `MountGeometry`, payload and chassis (p, n_g, 6), by the parameters `rows` (p,)."""
+    """Derivatives of the rows of `MountGeometry`, payload and chassis (p, n_g, 6), by p parameters.
 
-    rows: np.ndarray
+    parameters : (p,) indices of these among all free parameters.
+    """
+
+    parameters: tuple[int, ...]
     payload: np.ndarray
     chassis: np.ndarray
 
-    @staticmethod
-    def of(rig: Rig, names: Sequence[str]) -> MountSlopes:
-        """By those of the named parameters that move a mount. The rows are linear in places, so that the derivatives of
-        one rig are those of all rigs of its structure; they are cached for the most recent rigs."""
-        names = tuple(names)
-        for known, own, found in _slopes:
-            if known is rig and own == names:
-                return found
-        of_rig = [k for k, name in enumerate(names) if name in rig.parameters()]
-        slopes = [central_differences(_rows, rig, names[k]) for k in of_rig]
-        moving = [j for j, (payload, chassis) in enumerate(slopes) if np.any(payload) or np.any(chassis)]
-        shape = (len(moving), *mount_geometry(rig).payload.shape)
-        found = MountSlopes(
-            np.array(of_rig, int)[moving],
-            *(np.array([slopes[j][end] for j in moving]).reshape(shape) for end in (0, 1)),
-        )
-        _slopes.append((rig, names, found))
-        del _slopes[:-8]
-        return found
 
+@for_recent_rigs
+def mount_slopes(rig: Rig, names: tuple[str, ...], places: tuple[int, ...]) -> MountSlopes:
+    """Derivatives by the parameters names[k] with k in `places`. The rows are linear in them, so that the derivatives
+    of one rig are those of all rigs of its structure."""
 
-def _rows(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
-    mounts = MountGeometry.of(rig)
-    return mounts.payload, mounts.chassis
+    def rows(moved: Rig) -> tuple[np.ndarray, np.ndarray]:
+        mounts = MountGeometry.of(moved)
+        return mounts.payload, mounts.chassis
+
+    slopes = np.array([central_differences(rows, rig, names[k]) for k in places])
+    slopes = slopes.reshape(len(places), 2, *mount_geometry(rig).payload.shape)
+    return MountSlopes(places, slopes[:, 0], slopes[:, 1])
 
 
 class Assembled:

@@ -25,10 +25,9 @@ from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
 from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile
-from avis_ctrl.identification.maximum_likelihood import as_real, whitened, whitened_real, whitened_transient, whitener
+from avis_ctrl.identification.maximum_likelihood import Transient, whitened_real, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q
-from avis_ctrl.identification.spectra import transient_parts
 from avis_ctrl.identification.spectral_block import SpectralBlock
 from avis_ctrl.identification.weights import with_distortion
 
@@ -106,15 +105,9 @@ class Part:
         self.model, self.block = model, block
         self.L = whitener(block)
         self.made = model.assembled(block.omega)
-        self.transient = np.zeros((0, 0))
-        self.body: np.ndarray | None = None
-        self.inner: np.ndarray | None = None
+        transient = Transient.of(model, block, self.L)
+        self.transient, self.body, self.inner = transient.Q, transient.body, transient.inner
         self.response = TableResponse(self.made, self._acting(model))
-        if block.transient:
-            _, norms, self.transient, X = whitened_transient(model, block, self.L)
-            residual = as_real(whitened(self.L, block.Y - self.response.Y)[None])[0]
-            self.body, self.inner = transient_parts(X @ (self.transient.T @ residual), norms, block, model)
-            self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
         block = self.block
@@ -137,8 +130,7 @@ class Part:
         """(n, n_y, m) change of y by an effect, to first order."""
         response = self.response
         if effect.effect.nonlinear:
-            side = AtMotion(self.made, self.model.contribution(effect, self.block), np.zeros_like(response.x))
-            return side.Y + response.left @ side.push
+            return TableResponse(self.made, self.model.contribution(effect, self.block)).Y
         changed = Assembled(self.model.with_effect(effect).operators(self.block.omega))
         side = AtMotion(changed, response.acting, response.x)
         return side.Y - response.Y + response.left @ side.push

@@ -11,7 +11,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Added, Effect, EffectParameter, Table
 from avis_ctrl.gap.effects.large_motion import LargeMotion
-from avis_ctrl.gap.operators import Assembled, MountSlopes, Operators, mount_geometry
+from avis_ctrl.gap.operators import Assembled, MountSlopes, Operators, mount_geometry, mount_slopes
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, kept_lines
@@ -220,15 +220,18 @@ class TableModel(Table):
             (mounts.stiffness[:, None], found.K, found.K_floor),
             (mounts.damping[:, None], found.C, found.C_floor),
         ):
-            for row, dG, dG_c in zip(places.rows, places.payload, places.chassis, strict=True):
+            for row, dG, dG_c in zip(places.parameters, places.payload, places.chassis, strict=True):
                 by_payload[row] -= dG.T @ (values * G) + G.T @ (values * dG)
                 by_floor[row] -= dG.T @ (values * G_c) + G.T @ (values * dG_c)
         return found
 
     @cached_property
     def mount_slopes(self) -> MountSlopes:
-        """Derivatives of the mounts' geometry with respect to the rig's free parameters."""
-        return MountSlopes.of((self.nominal or self.base).rig, self.base.names)
+        """Derivatives of the mounts' geometry with respect to the rig's free parameters that move a mount, and thereby
+        change the stiffness matrix."""
+        changes = self.effective.derivative_matrices.K.any(axis=(1, 2))
+        places = [k for k in np.flatnonzero(changes) if not MOUNT.fullmatch(self.base.names[k])]
+        return mount_slopes((self.nominal or self.base).rig, self.base.names, tuple(places))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -391,8 +394,7 @@ class TableModel(Table):
                 slope = Added(
                     *(None if a is None or b is None else (a - b) / width for a, b in zip(up, down, strict=True))
                 )
-                side = AtMotion(made, self._alone(omega, slope), np.zeros_like(response.x))
-                dY[row] = side.Y + response.left @ side.push
+                dY[row] = TableResponse(made, self._alone(omega, slope)).Y
                 continue
             sides = [AtMotion(table, response.acting, response.x) for table in tables]
             # d x = inv(D) (d F - d D x): no second inverse.

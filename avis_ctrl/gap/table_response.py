@@ -109,7 +109,8 @@ class TableResponse(DrivenTable):
                 value="loop_delay_s",
             )
         made, ops, s, per_force = self.made, self.made.ops, self.s, self.left
-        own = made.G @ self.x
+        q, chassis = self.x[:, :N_Q], made.chassis(self.x, self.w, self.acting.inner)
+        own, moved = made.G @ self.x, ops.mounts.chassis @ chassis
         through = per_force @ made.G.T
         inertial = per_force[:, :, :N_Q]
         if ops.recoil is not None:
@@ -126,9 +127,9 @@ class TableResponse(DrivenTable):
             self.gain * self.alias,
             made.hold[:, None, None],
             self.folded,
-            self.x[:, :N_Q],
+            q,
             made.follow(self.w),
-            made.chassis(self.x, self.w, self.acting.inner),
+            chassis,
             self.Y if self.acting.output is None else self.Y - self.acting.output,
         )
         dY = operands.derivative(model.names, d, more)
@@ -145,7 +146,6 @@ class TableResponse(DrivenTable):
             slope, folded = driven.drive_slopes(ops.omega, AMPLIFIERS)
             by_force, aliased = made.T @ (slope * self.folded), model.accelerance @ self.folded
             dY[model.names.index(AMPLIFIERS)] = per_force @ by_force + self.gain * folded * aliased
-        moved = ops.mounts.chassis @ made.chassis(self.x, self.w, self.acting.inner)
         rows = {name: k for k, name in enumerate(ops.mounts.names)}
         for kind in "kc":
             found = [
@@ -161,11 +161,10 @@ class TableResponse(DrivenTable):
             else:
                 push = s * ops.damping_factor[:, k, None] * (moved[:, k] - own[:, k])
             dY.transpose(1, 3, 2, 0)[..., j] = through[:, None, :, k] * push.swapaxes(1, 2)[:, :, None]
-        q, chassis = self.x[:, :N_Q], made.chassis(self.x, self.w, self.acting.inner)
         pull = made.z_pf[:, :, None] * moved - made.z_pp[:, :, None] * own
         if self.acting.inner is not None and self.acting.inner.size:
             pull = pull + made.push_of_masses_inside(self.acting.inner)
-        for row, payload, base in zip(places.rows, places.payload, places.chassis, strict=True):
+        for row, payload, base in zip(places.parameters, places.payload, places.chassis, strict=True):
             push = made.z_pf[:, :, None] * (base @ chassis) - made.z_pp[:, :, None] * (payload @ q)
             dY[row] += per_force[:, :, :N_Q] @ (payload.T @ pull) + through @ push
         return dY

@@ -46,11 +46,12 @@ class Data:
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) residual per block in the unit of
-    y."""
+    y. transients : of the blocks, to which e and J belong."""
 
     e: np.ndarray
     J: np.ndarray
     left: list[np.ndarray]
+    transients: Sequence[Transient] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +178,6 @@ class _Expansion:
     model: Any
     z: np.ndarray
     now: Evaluated
-    transients: Sequence[Transient]
     H: np.ndarray
     g: np.ndarray
     cost: float
@@ -188,7 +188,7 @@ class _Expansion:
 
 
 def descent(
-    expand: Callable[[np.ndarray, bool, _Expansion | None], _Expansion],
+    expand: Callable[[np.ndarray, bool, Evaluated | None], _Expansion],
     z: np.ndarray,
     priors: Priors,
     iterations: int,
@@ -197,8 +197,8 @@ def descent(
     """Gauss-Newton steps from z, each damped until it descends (Levenberg 1944); the last expansion, and the number of
     steps.
 
-    expand : expansion at z; whether with the derivative, without which only the sum of squares is needed; and the
-        expansion whose transients it keeps, which change little in a small step, or None. Raises InputError if no rig
+    expand : expansion at z. The flag asks for the derivative; without it, only the sum of squares is needed. The last
+        argument is an evaluation whose transients are kept, as in a small step, or None. Raises InputError if no rig
         has these values.
 
     All parameters stay within their bounds; with a parameter at its bound, the remaining ones still reach their
@@ -215,12 +215,12 @@ def descent(
         expected = (undamped - at.z) @ (at.g - at.z)
         if expected < settings.converged * len(at.now.e):
             return at, steps
-        near = at if expected < settings.settled else None
+        near = at.now if expected < settings.settled else None
         for damping in _dampings(at.H, needed, settings):
             z = priors.stepped(at.z, _bounded_step(at, damping, bounds) if damping else undamped)
             try:
                 # For a step that may be rejected, the derivative is not needed yet.
-                if not (damping or needed) or expand(z, False, at).whole < at.whole:
+                if not (damping or needed) or expand(z, False, at.now).whole < at.whole:
                     after = expand(z, True, near)
                     if after.whole < at.whole:
                         at, needed = after, damping
@@ -281,11 +281,10 @@ def fit(
         paths = [path_contributions(model, block) for block in data.blocks]
         weights = weigh(data.blocks, data.levels, paths, variances, settings)
 
-        def expand(z: np.ndarray, derivative: bool, near: _Expansion | None, weights: Weights = weights) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool, near: Evaluated | None, weights: Weights = weights) -> _Expansion:
             moved = begun.at(priors.values(z))
-            transients = near.transients if near else _transients(moved, data, weights)
-            now = _evaluate(moved, priors, z, data, weights, transients, derivative)
-            return _Expansion(moved, z, now, transients, *weights.normal_equations(now.J, now.e))
+            now = _evaluate(moved, priors, z, data, weights, derivative, near)
+            return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
 
         at, more = descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
@@ -385,14 +384,13 @@ class Profile:
         rest = -(self.fitted.z if at is None else at)
         weights = self.fitted.weights
 
-        def expand(z: np.ndarray, derivative: bool, near: _Expansion | None) -> _Expansion:
+        def expand(z: np.ndarray, derivative: bool, near: Evaluated | None) -> _Expansion:
             moved = model.at(priors.values(z))
-            transients = near.transients if near else _transients(moved, self.data, weights)
-            now = _evaluate(moved, priors, z, self.data, weights, transients, derivative)
+            now = _evaluate(moved, priors, z, self.data, weights, derivative, near)
             # The products of the rows that `free` would return.
             H, g, cost = weights.normal_equations(now.J, now.e)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e) :] @ rest
-            return _Expansion(moved, z, now, transients, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
+            return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
 
         end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
@@ -412,8 +410,7 @@ def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tupl
     """Weights and (N,) residual of records that were not fitted, as `Fitted.weights` and `Fitted.e`."""
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
-    transients = _transients(fitted.model, data, weights)
-    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, transients, derivative=False)
+    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
     return weights, weights.flatten(own.e[None])[0]
 
 
@@ -424,22 +421,21 @@ def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
     }
 
 
-def _transients(model: Any, data: Data, weights: Weights) -> list[Transient]:
-    return [Transient.of(model, block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True)]
-
-
 def _evaluate(
     model: Any,
     priors: Priors,
     z: np.ndarray,
     data: Data,
     weights: Weights,
-    transients: Sequence[Transient],
     derivative: bool = True,
+    near: Evaluated | None = None,
 ) -> Evaluated:
+    """near : whose transients are kept."""
+    blocks = [(block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True)]
+    transients = near.transients if near else [Transient.of(model, *one) for one in blocks]
     parts = [
-        transient.residual(model, block, L[:, None], derivative=derivative)
-        for transient, block, L in zip(transients, data.blocks, weights.L, strict=True)
+        transient.residual(model, *one, derivative=derivative)
+        for transient, one in zip(transients, blocks, strict=True)
     ]
     e = np.concatenate([one[0] for one in parts])
     J = np.empty((len(z) if derivative else 0, len(e)))
@@ -447,4 +443,4 @@ def _evaluate(
     for own, rows, _ in parts if derivative else ():
         np.multiply(rows, slopes, out=J[:, start : start + len(own)])
         start += len(own)
-    return Evaluated(e, J, [left for _, _, left in parts])
+    return Evaluated(e, J, [left for _, _, left in parts], transients)

@@ -379,13 +379,14 @@ def block_residual(
 
 @dataclass(frozen=True, eq=False)
 class Transient:
-    """Transient of a block during a fit: that of known initial values, which changes with the model, and Q (N, r),
-    whitened, a basis of all others, which are projected out.
+    """Transient of a block during a step of a fit: the response to fixed initial values is part of the model; all other
+    transients are projected out.
 
-    body, inner : initial values as in `transient_parts`; None for a block without a transient.
+    Q : (N, r) orthonormal basis of the whitened transients at the start of the step. body, inner : the initial values,
+        as in `transient_parts`; None for a block without a transient.
 
-    The gradient is exact, also if residuals have other weights than those of the projection; that of `block_residual`
-    is exact with its own weights only, because it leaves out how the basis changes (L. Kaufman, BIT 15 (1975) 49-57).
+    With a fixed basis the gradient is exact for any weights of the residuals. `block_residual` leaves out that its
+    basis depends on the parameters (L. Kaufman, BIT 15 (1975) 49-57); its gradient is exact with its own weights only.
     """
 
     Q: np.ndarray
@@ -405,8 +406,7 @@ class Transient:
         self, model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """e (N,) and J (n_p, N) as `block_residual`, and the residual (n, n_y) in the unit of y."""
-        inner = {} if self.inner is None else {"inner": self.inner}
-        found = model.answer(block, self.body, derivative, **inner)
+        found = model.answer(block, self.body, derivative, self.inner)
         white = whitened(L, block.Y - found.Y)
         e = as_real(white[None])[0]
         J = whitened_real(L, found.dY) if derivative else np.empty(0)

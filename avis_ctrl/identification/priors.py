@@ -85,16 +85,16 @@ class Priors:
 
     @cached_property
     def _adds(self) -> np.ndarray:
-        """(n,) positive parameters that act as sums: masses, stiffnesses and dampings, but not gains."""
+        """(n,) which parameters are positive and add up: masses, stiffnesses and dampings, but not gains."""
         return self.positive & np.array([not name.startswith(_GAINS) for name in self.names], bool)
 
     def stepped(self, z: np.ndarray, end: np.ndarray) -> np.ndarray:
         """(n,) standardised values whose parameters have moved as they would to first order from z to `end`.
 
-        A gain multiplies others, so that its logarithm moves. Masses, stiffnesses and dampings add up: where the data
-        determine a sum of dampings but not each of them, equal and opposite steps of two logarithms change the sum, and
-        a fit proceeds by ever shorter steps. Such a parameter moves itself, by less if it would lose more than half of
-        its value.
+        Gains multiply each other, so the step is one of their logarithms. Masses, stiffnesses and dampings add up:
+        where the data determine a sum of dampings but not each of them, equal and opposite steps of two logarithms
+        would change the sum, and a fit would need ever shorter steps. The step is therefore one of these parameters
+        themselves, and shorter if one would lose more than half of its value.
         """
         low, high = self.bounds
         # A step that ends at a bound ends there exactly.
@@ -109,7 +109,7 @@ class Priors:
         return np.where(self.positive, self.sigma * self.values(z), self.sigma)
 
 
-# Start of the names of gains.
+# The names of gains start with these.
 _GAINS = ("sensor.", "actuator.")
 _FIELDS = ("mean", "sigma", "positive", "low", "high")
 

@@ -37,29 +37,25 @@ def line(
     probability: float = 0.95,
     verdict: str = "explained",
 ) -> Line:
-    effects, traces = (
-        [
-            {
-                "name": name,
-                "location": "payload",
-                "parameters": {},
-                "probability": probability,
-                "indistinguishable_from": [],
-            }
-            for name in some
-        ]
-        for some in (named, ("loop_delay",))
-    )
+    def given(name: str) -> dict:
+        return {
+            "name": name,
+            "location": "payload",
+            "parameters": {},
+            "probability": probability,
+            "indistinguishable_from": [],
+        }
+
     answer = {
         "format": "avis-gap",
         "version": 1,
         "verdict": verdict,
-        "effects": effects,
+        "effects": list(map(given, named)),
         "gap": [],
         "where": [],
         "next_experiment": None,
         "seconds": 1.0,
-        "traces": traces,
+        "traces": [given("loop_delay")],
     }
     return Line.model_validate(
         {

@@ -190,7 +190,7 @@ class AxisModel:
         """(p,) steps of the central differences."""
         raise NotImplementedError
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True, inner: None = None) -> Driven:
         """Predicted outputs (n, n_y, 1) on the lines of a block, and their derivatives (p, n, n_y, 1)."""
         Y, dY = self.predicted(block), []
         if derivative:
@@ -222,7 +222,7 @@ class MassModel(AxisModel):
             ]
         )
 
-    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True) -> Driven:
+    def answer(self, block: SpectralBlock, body: None = None, derivative: bool = True, inner: None = None) -> Driven:
         n, s, around, several = len(self.base), 1j * block.omega, self.lines.around(block.omega), self.parts
         A, V, Q, F = (
             self.lines.pick(one, block.name) for one in (self.lines.A, self.lines.V, self.lines.Q, self.lines.F)

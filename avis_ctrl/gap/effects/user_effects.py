@@ -96,8 +96,8 @@ def _tried(effect: Effect, model: TableModel) -> None:
     for method in ("change", "rig_changes"):
         if effect.nonlinear and getattr(type(effect), method) is not getattr(Effect, method):
             raise InputError(
-                "expected no such method in an effect that depends on amplitude or time; its force or volts represent "
-                "all of it",
+                "expected no such method in an effect that depends on amplitude or time; express all of it as force or "
+                "volts",
                 field=method,
             )
     omega = 2 * np.pi * np.array(SETTINGS.tried_Hz)

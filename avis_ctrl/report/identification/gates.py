@@ -33,9 +33,7 @@ def gates(findings: Sequence[Finding]) -> Section:
     rows = [(gate, MARKS[severity], text) for gate, severity, text in together]
     listed = [severity for _, severity, _ in together]
     counts = ", ".join(
-        f"{n} {s}{'s' * (n > 1 and s in ('note', 'warning', 'stop'))}"
-        for s in (*reversed(SEVERITIES), "not tested")
-        if (n := listed.count(s))
+        f"{n} {s}{'s' * (n > 1 and s not in ('ok', 'not tested'))}" for s in reversed(MARKS) if (n := listed.count(s))
     )
     pieces: list[Piece] = [
         table(
