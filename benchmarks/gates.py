@@ -41,7 +41,7 @@ from avis_ctrl.measurement.gates import Finding, examine
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
-from avis_ctrl.simulation.rehearsal import perturbed_truth
+from avis_ctrl.simulation.perturbed_campaign import perturbed_truth
 from avis_ctrl.study.identification import IdentifyOptions, start_model
 from avis_ctrl.study.plausible_records import check_records
 from avis_ctrl.study.record_checks import expectation

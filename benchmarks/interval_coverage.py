@@ -34,8 +34,8 @@ from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.floor_spectrum import shipped_spectrum
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
 
@@ -80,7 +80,7 @@ class Trial:
     seconds: float
 
 
-def combinations(rig: AvisTable, names: Sequence[str]) -> dict[str, np.ndarray]:
+def combinations(rig: IsolatorTable, names: Sequence[str]) -> dict[str, np.ndarray]:
     """What payload motion determines, from the geometry alone: body, and sums of stiffness and damping over mounts."""
     found = {name: np.eye(len(names))[names.index(name)] for name in ("mass", "J1", "J2", "J3")}
     x, y = (np.array([one.position[k] for one in rig.isolators]) for k in (0, 1))
@@ -99,7 +99,7 @@ def combinations(rig: AvisTable, names: Sequence[str]) -> dict[str, np.ndarray]:
     return found
 
 
-def truth_of(rig: AvisTable, names: Sequence[str], rng: np.random.Generator) -> AvisTable:
+def truth_of(rig: IsolatorTable, names: Sequence[str], rng: np.random.Generator) -> IsolatorTable:
     """5 % about the file's values, damping 20 %."""
     known = rig.parameters()
     return rig.with_parameters(
@@ -132,7 +132,7 @@ def trial(settings: Settings, seed: int) -> Trial:
     """One campaign from its seed to its errors."""
     with threadpool_limits(1):
         rig = load_rig("avis")
-        assert isinstance(rig, AvisTable)
+        assert isinstance(rig, IsolatorTable)
         names = default_parameters(rig)
         true_rig = truth_of(rig, names, np.random.default_rng([seed, 77]))
         campaign = simulate_campaign(rig, settings.plan(), seed, truth=true_rig)
@@ -224,7 +224,7 @@ def main() -> None:
     began = time.monotonic()
     trials = run(settings, range(given.seed, given.seed + given.campaigns), given.processes)
     rig = load_rig("avis")
-    assert isinstance(rig, AvisTable)
+    assert isinstance(rig, IsolatorTable)
     print_report(trials, list(combinations(rig, default_parameters(rig))))
     print(f"\n{time.monotonic() - began:.0f} s")
 

@@ -38,7 +38,7 @@ from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.simulation.campaign_data import SETTINGS as CAMPAIGN
 from avis_ctrl.simulation.campaign_data import open_loop
 from avis_ctrl.simulation.loop import SimulationRecord, simulate
-from avis_ctrl.simulation.rehearsal import perturbed_truth
+from avis_ctrl.simulation.perturbed_campaign import perturbed_truth
 from avis_ctrl.simulation.sampled_loop import SampledLoop
 from avis_ctrl.study.plan_file import plan_from_table
 

@@ -27,7 +27,14 @@ def run(text: str, level: str, folder: Path) -> tuple[str, run_pages.Runner]:
 
 
 def runnable() -> list[Path]:
-    return [page for page in PAGES if page.read_text().startswith("---\nrun: true")]
+    return [page for page in PAGES if page.read_text().startswith("---\nrun: true\n")]
+
+
+def test_the_heads_of_pages_are_closed():
+    for page in PAGES:
+        text = page.read_text()
+        if text.startswith("---"):
+            assert re.match(r"---\n(\w+: \w+\n)+---\n", text), page
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning", "ignore::RuntimeWarning")

@@ -92,7 +92,7 @@ def test_the_commands_work_from_the_wheel_alone(wheel: Path, tmp_path: Path) -> 
     run(str(script), "excite", "--rig", "avis", "--out", "signals.h5")
     assert (tmp_path / "signals.h5").stat().st_size > 1000
     code = (
-        "from avis_ctrl.report import html, pdf\nfrom avis_ctrl.report.pieces import Document, Paragraph, Section\n"
+        "from avis_ctrl.report import html, pdf\nfrom avis_ctrl.report.elements import Document, Paragraph, Section\n"
         "page = Document('t', 's', 'x', (Section('a', 'a', (Paragraph('text'),)),))\n"
         "print(len(html.render(page)), len(pdf.render(page)))"
     )

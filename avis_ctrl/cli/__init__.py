@@ -13,13 +13,13 @@ from typing import Annotated, Any
 import typer
 
 import avis_ctrl
+from avis_ctrl.cli.campaigns import convert, excite, simulate_campaign
 from avis_ctrl.cli.console import Terminal
 from avis_ctrl.cli.design import compare, design
 from avis_ctrl.cli.export import export
 from avis_ctrl.cli.gap import gap
 from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.cli.identify import identify, predict, single_axis
-from avis_ctrl.cli.measure import convert, excite, simulate_campaign
 from avis_ctrl.cli.new import app as new
 from avis_ctrl.cli.sweep import sweep
 from avis_ctrl.errors import AvisError, ComputationError, InputError, UserInterruptError
@@ -40,12 +40,7 @@ class InterruptSettings:
 SETTINGS = InterruptSettings()
 
 # Markdown: paragraphs of the help are wrapped to the terminal.
-app = typer.Typer(
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    help="Workbench for active vibration isolation tables.",
-)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="markdown")
 
 
 def _version(asked: bool) -> None:

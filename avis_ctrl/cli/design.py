@@ -60,7 +60,7 @@ def _verdict(terminal: Terminal, result: DesignResult) -> None:
 
 def compare(
     first: Annotated[Path, typer.Argument(metavar="DESIGN_A", help="output folder of avis design")],
-    second: Annotated[Path, typer.Argument(metavar="DESIGN_B", help="another one")],
+    second: Annotated[Path, typer.Argument(metavar="DESIGN_B", help="output folder of another design")],
 ) -> None:
     """Compare two designs side by side: differences of the design files, and the results."""
     from rich.markup import escape

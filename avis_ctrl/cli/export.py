@@ -131,15 +131,15 @@ def _summary(terminal: Terminal, made: Package) -> None:
         ("worst-case transmissibility in the band", found["worst_case_band_transmissibility_dB"], " dB"),
         ("worst-case gain, between samples too", found["between_samples"]["worst_case_gain_dB"], " dB"),
         ("worst plant simulated with the compiled code", made.replay and 20 * math.log10(made.replay.gain), " dB"),
-        ("gain at rest, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
+        ("gain at zero frequency, drive volts per sensor volt", found["at_rest"]["gain_V_per_V"], " V/V"),
         (
             f"drive {found['at_rest']['drive']}: voltage for offsets of {1e3 * found['at_rest']['offset_V']:.3g} mV",
             found["at_rest"]["drive_V"],
             " V",
         ),
         ("the same, relative to its limit", found["at_rest"]["percent_of_limit"], " %"),
-        ("payload velocity by rounding, bound", found["rounding_noise_m_per_s"], " m/s"),
-        ("time of one step on this machine", found["step_time_us"], " us"),
+        ("bound on the payload velocity caused by rounding", found["rounding_noise_m_per_s"], " m/s"),
+        ("execution time per sample on this machine", found["step_time_us"], " us"),
     )
     terminal.table(
         ("computed from the exported numbers", ""),

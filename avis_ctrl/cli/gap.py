@@ -20,7 +20,7 @@ CAMPAIGN: records of the rig: HDF5, .mat, UFF 58 or CSV
 --rig RIG: avis, halcyonics, halcyonics_loaded or a rig.toml
 --out DIR: folder for gap.json, report and models
 --columns ROLE=NAME,..: which variable of the file is what, as in avis identify
---band LOW HIGH: Hz; by default the excited band
+--band LOW HIGH: fitted band [Hz]; by default the excited band
 --amplifier-corner: expected corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
     accelerometers. The time constant is fitted (docs/gap_engine.md)
 --design: also design controllers on both models, to show the influence of the effect on mu (about a minute more)

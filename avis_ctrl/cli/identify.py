@@ -33,7 +33,7 @@ MEASUREMENT: HDF5 campaign, .mat, UFF 58, CSV or a folder of CSV; records or fre
 --parameter NAME: parameter to fit, such as 'isolator*.k_z' (repeatable); by default mass, inertia, stiffness, damping
 --prior NAME=MEAN+-STD: prior knowledge of a parameter (repeatable)
 --hold-out RECORD: record kept for validation (repeatable); chosen automatically by default
---band LOW HIGH: Hz; by default the excited band
+--band LOW HIGH: fitted band [Hz]; by default the excited band
 --starts: number of starting points of the fit
 --amplifier-corner: expected corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
     accelerometers. For records of a table on isolators, the time constant is fitted (docs/gap_engine.md)
@@ -212,7 +212,9 @@ def _summary(terminal: Terminal, found: Identification) -> None:
     for one in found.campaign_fit.tolerances[:5]:
         said.append(f"{one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
     if found.advice:
-        said.append(f"{found.advice[0]} (Other records that would help are in section 5 of the report.)")
+        said.append(
+            f"{found.advice[0]} (The section on identifiability of the report lists other records that would help.)"
+        )
     terminal.print(*(f"- {sentence}" for sentence in said))
 
 
@@ -222,7 +224,7 @@ MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency
 --columns ROLE=NAME,..: seismometer: drive, coil and/or displacement; decay: y; drive: force, position, reference;
     oscillator: u, y; each also t
 --scale ROLE=FACTOR,..: factors to SI units
---sample-rate: Hz, if the file has none
+--sample-rate: sample rate [Hz], if the file has no time column
 """)
 
 

@@ -10,7 +10,7 @@ from avis_ctrl.cli.console import Terminal
 from avis_ctrl.cli.options import Options
 
 SWEEP = Options("""
-POINTS.toml: a base and the keys that vary (docs/sweep.md)
+POINTS.toml: a base design and the keys that vary (docs/sweep.md)
 --out DIR: folder for table, picture and points
 --scheduler ADDRESS: a dask scheduler of a cluster, such as tcp://HOST:8786
 --workers N: start a dask scheduler with N workers on this machine

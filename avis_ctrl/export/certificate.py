@@ -19,7 +19,7 @@ from avis_ctrl.lti.norms import decibels
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.simulation.discrete import spectral_radius
 from avis_ctrl.simulation.sampled_loop import SampledLoop
-from avis_ctrl.study.at_rest import at_rest
+from avis_ctrl.study.dc_gain import at_rest
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
 

@@ -17,11 +17,11 @@ from avis_ctrl.rigs.file_errors import read_json
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.discrete import digital_controller
 from avis_ctrl.simulation.sampled_loop import SampledLoop
-from avis_ctrl.study.companions import Companion
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.other_axes import Companion
 from avis_ctrl.study.plant import DesignPlant, build_plant
-from avis_ctrl.study.saved import read_saved
 from avis_ctrl.study.simulation import bare_loop
+from avis_ctrl.study.study_file import read_saved
 
 
 @dataclass(frozen=True, eq=False)

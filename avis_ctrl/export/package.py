@@ -20,9 +20,9 @@ from avis_ctrl.export.bounds import StabilityNotProvedError
 from avis_ctrl.export.c_source import HEADER, SOURCE, Provenance, c_files, constants_of
 from avis_ctrl.export.certificate import Certificate, Progress, certify, shipped_loop
 from avis_ctrl.export.compiled import compiler, step_time_us
+from avis_ctrl.export.compiled_simulation import CompiledSimulation, simulate_worst_plant
 from avis_ctrl.export.design_folder import Added, DesignFolder
 from avis_ctrl.export.protection import Protection, protection
-from avis_ctrl.export.replay import Replay, replay_worst_plant
 from avis_ctrl.export.sampled_controller import Arithmetic, SampledController, parse_controller, read_controller
 from avis_ctrl.export.vectors import agreement_V, as_csv, expected_V, read_csv, restarts, vectors
 from avis_ctrl.rigs.file_errors import read_json
@@ -50,7 +50,7 @@ class Package:
     certificate: Certificate
     contents: dict[str, bytes]
     anti_windup: Choice
-    replay: Replay | None = None
+    replay: CompiledSimulation | None = None
 
 
 def formats_of(text: str) -> tuple[str, ...]:
@@ -99,7 +99,7 @@ def make_package(
         certificate = replace(
             certificate, content={**certificate.content, "step_time_us": step_time_us(plain, controller)}
         )
-        replay = replay_worst_plant(folder, certificate, controller, plain)
+        replay = simulate_worst_plant(folder, certificate, controller, plain)
         if replay.record.diverged:
             raise ComputationError("the worst plant diverged under the compiled code; nothing was written")
     contents, content = {CONTROLLER: text}, dict(certificate.content)

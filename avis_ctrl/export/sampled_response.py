@@ -33,7 +33,7 @@ from avis_ctrl.export.sampled_controller import SampledController
 from avis_ctrl.lti.magnitude_fit import covering_fit
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.lti.statespace import StateSpace, append, gain
-from avis_ctrl.rigs.actuator import pade_delay
+from avis_ctrl.rigs.delay_models import pade_delay
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.rigs.sensing import Filter, conditioning

@@ -15,7 +15,7 @@ import numpy as np
 from avis_ctrl.gap.detection_limits import detection_limits
 from avis_ctrl.gap.effects.base import Effect
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed import unnamed_faults
+from avis_ctrl.gap.effects.outside_library import unnamed_faults
 from avis_ctrl.gap.line_response import clear_cache
 from avis_ctrl.gap.next_measurement import between, grows_faster, of_unexplained
 from avis_ctrl.gap.preparation import Prepared, mended_with, prepare, with_noise_from, with_second_order

@@ -24,8 +24,8 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import campaign_clock
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.identification.response import ResponseModel, sensor_model
-from avis_ctrl.rigs.avis import INERTIA, AvisTable
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
+from avis_ctrl.rigs.isolator_table import INERTIA, IsolatorTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -160,7 +160,7 @@ def _made(file: ModelFile) -> TableModel:
         raise InputError(error.expected, field=f"rig: {error.field}", value=error.value) from None
     except (ValueError, RecursionError) as error:
         raise InputError(f"expected the text of a rig file; {' '.join(str(error).split())}", field="rig") from None
-    if isinstance(rig, AvisTable):
+    if isinstance(rig, IsolatorTable):
         rig = rig.with_directions_by(file.free)
     sensors = sensor_model(rig, file.unit, file.sensors)
     if unknown := sorted(

@@ -21,9 +21,9 @@ from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
 from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
+from avis_ctrl.gap.signals.declipping import repair
 from avis_ctrl.gap.signals.hum import HumFinding, find_hum, polluted
 from avis_ctrl.gap.signals.record_residual import RecordResidual
-from avis_ctrl.gap.signals.repair import repair
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.campaign_fit import excited_band, levels_of
 from avis_ctrl.identification.likelihood import Data

@@ -24,7 +24,7 @@ from avis_ctrl.identification.sample_and_hold import hold
 from avis_ctrl.lti.connect import connect
 from avis_ctrl.lti.rational import cascade, second_order_roots
 from avis_ctrl.lti.statespace import StateSpace, append, gain
-from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
+from avis_ctrl.rigs.delay_models import pade_delay, zero_order_hold
 from avis_ctrl.rigs.rigid_body import COORDINATES, GRAVITY
 from avis_ctrl.uncertainty.uncertain_rig import edge_name, uncertain_rig
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 
 from avis_ctrl.gap.campaign_spectra import all_silent
-from avis_ctrl.gap.power_shares import power_shares
+from avis_ctrl.gap.power_fractions import power_shares
 from avis_ctrl.gap.preparation import Prepared
 from avis_ctrl.gap.result import HeatMap, PowerShares, RecordGap, Where
 from avis_ctrl.gap.table_model import TableModel

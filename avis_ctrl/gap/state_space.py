@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.gap.effects.attached import elements
+from avis_ctrl.gap.effects.attached_oscillator import elements
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import Values, shares
 from avis_ctrl.gap.effects.cable import tie

@@ -16,7 +16,7 @@ from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.table_response import MOUNT, Acting, AtMotion, TableResponse
 from avis_ctrl.identification.response import Driven, Matrices, ResponseModel, kept_lines
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.structure import structural_null_space, structure_of
+from avis_ctrl.identification.structural_identifiability import structural_null_space, structure_of
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from avis_ctrl.gap import (
     campaign_spectra,
     line_response,
     next_measurement,
-    power_shares,
+    power_fractions,
     record_motion,
     residual,
     score,
@@ -20,7 +20,7 @@ from avis_ctrl.gap import (
 )
 from avis_ctrl.gap.axis import settings as axis
 from avis_ctrl.gap.effects import base
-from avis_ctrl.gap.signals import converter, hum, noise_level, quiet_lines
+from avis_ctrl.gap.signals import converter, hum, noise_level, noise_lines
 from avis_ctrl.identification import campaign_fit
 from avis_ctrl.measurement.gates import sample_clock
 
@@ -32,7 +32,7 @@ PARTS = (
     table_model,
     campaign_spectra,
     residual,
-    power_shares,
+    power_fractions,
     next_measurement,
     record_motion,
     line_response,
@@ -40,7 +40,7 @@ PARTS = (
     converter,
     hum,
     noise_level,
-    quiet_lines,
+    noise_lines,
     sample_clock,
     axis,
     campaign_fit,

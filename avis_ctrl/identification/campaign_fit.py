@@ -24,8 +24,8 @@ from avis_ctrl.identification.tolerance_fit import as_likelihood_fit, begin, end
 from avis_ctrl.measurement.campaign import Campaign, Portion, Record, RecordSource
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.local_polynomial import noise_covariance
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.rigs.rig import Rig
 
 Progress = Callable[[str], None]
@@ -346,7 +346,7 @@ class CampaignFit:
 def fits_tolerances(measured: Campaign | FrequencyResponse, rig: Rig) -> bool:
     """Whether `fit_campaign` can fit the tolerances of the rig file: those of records of a table on isolators, whose
     channels can be separated."""
-    return isinstance(measured, Campaign) and isinstance(rig, AvisTable)
+    return isinstance(measured, Campaign) and isinstance(rig, IsolatorTable)
 
 
 def fit_campaign(
@@ -394,10 +394,13 @@ def fit_campaign(
             blocks = noise_from_residuals(first.residuals, blocks, first.model)
         levels = levels_of(campaign.records)
         begun = begin(turned, without(blocks, added), levels, within, priors or {})
-        say(f"with {int(np.sum(~begun.flat))} tolerances of the rig file: {begun.fitted.iterations} iterations")
+        say(
+            f"fit with {int(np.sum(~begun.flat))} values of the rig file within their tolerances: "
+            f"{begun.fitted.iterations} iterations"
+        )
         linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])
         ended = end(begun, linear, levels)
-        say(f"with their second-order terms: {ended.fitted.iterations} iterations")
+        say(f"fit with their second-order terms: {ended.fitted.iterations} iterations")
         found = as_likelihood_fit(ended, linear, first)
         moved = ended.fitted.moved([name for name in found.model.names if name not in model.names])
         return CampaignFit(found, first, band_Hz, tuple(notes), model, known, moved)

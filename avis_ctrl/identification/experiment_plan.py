@@ -14,7 +14,7 @@ from avis_ctrl.identification.identifiability import identifiability_report
 from avis_ctrl.identification.identifiability_text import combination_text
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import FLOOR, ResponseModel
-from avis_ctrl.identification.structure import structural_null_space, structure_of
+from avis_ctrl.identification.structural_identifiability import structural_null_space, structure_of
 from avis_ctrl.summary import joined
 
 CAUTION = (

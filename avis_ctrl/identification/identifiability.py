@@ -19,7 +19,7 @@ from avis_ctrl.identification.identifiability_text import (
 from avis_ctrl.identification.information import SETTINGS as INFORMATION
 from avis_ctrl.identification.information import Combination, Information
 from avis_ctrl.identification.response import ResponseModel, size_of
-from avis_ctrl.identification.structure import Structure, structural_null_space, structure_of
+from avis_ctrl.identification.structural_identifiability import Structure, structural_null_space, structure_of
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl import uncertain_value
 from avis_ctrl.identification.information import Combination, Information
-from avis_ctrl.identification.structure import Scaling
+from avis_ctrl.identification.structural_identifiability import Scaling
 from avis_ctrl.summary import joined
 
 _KINDS = {

@@ -26,8 +26,8 @@ from avis_ctrl.identification.maximum_likelihood import (
 from avis_ctrl.identification.priors import beside, identified
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.instruments import Tolerances
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 
 
 class ToleranceFit(NamedTuple):
@@ -52,7 +52,7 @@ def begin(
     model : with these parameters free. levels : [V] by record.
     stated : (mean, standard deviation) of parameters that have a prior.
     """
-    assert isinstance(model.rig, AvisTable)  # each channel at its own position
+    assert isinstance(model.rig, IsolatorTable)  # each channel at its own position
     rig = model.rig.with_channels_apart()
     rest = beside(replace(model, rig=rig, names=()), model.names, tolerances)
     priors = identified(model, stated).followed_by(rest)

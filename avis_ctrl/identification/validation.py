@@ -16,9 +16,9 @@ import numpy as np
 from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.identification.campaign_fit import CampaignFit, measured_noise
+from avis_ctrl.identification.measured_responses import ResponseOverlay, measured_response, overlay
 from avis_ctrl.identification.modes import MeasuredModes, ModeRow, measured_modes, mode_table
 from avis_ctrl.identification.noise import noise_from_residuals
-from avis_ctrl.identification.overlays import ResponseOverlay, measured_response, overlay
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.predictor import predict
 from avis_ctrl.identification.response import ResponseModel

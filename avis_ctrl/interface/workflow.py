@@ -21,7 +21,7 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.design_file import Design, design_from_table, read_study
 from avis_ctrl.study.gap import GapOptions, find_gap
-from avis_ctrl.study.hidden_effects import rehearse_with_effects
+from avis_ctrl.study.hidden_effects import campaign_with_effects
 from avis_ctrl.study.identification import IdentifyOptions
 from avis_ctrl.study.identification import identify as identify_rig
 from avis_ctrl.study.plan_file import default_plan, plan_from_table, read_plan
@@ -74,7 +74,7 @@ def simulate_campaign(
     seed: int = 1,
     progress: Progress | None = None,
 ) -> Campaign:
-    """Simulate a campaign with the nonlinear table, to rehearse an identification; as `avis simulate-campaign`.
+    """Simulate a campaign with the nonlinear table, as `avis simulate-campaign` does, to try an identification.
 
     plan : file or keys of docs/campaign_plan.md; by default multisines at three levels, noise, rest, a shaken floor.
         Its `effect` sections add effects that the rig file does not contain.
@@ -96,7 +96,7 @@ def simulate_campaign(
         else read_plan(plan)
     )
     record_done = None if progress is None else lambda k, total, name: progress(f"record {name}, {k} of {total}")
-    return rehearse_with_effects(table, chosen, seed, record_done).campaign
+    return campaign_with_effects(table, chosen, seed, record_done).campaign
 
 
 def identify(

@@ -7,7 +7,7 @@ The contents are assembled by `content.document`, `identification.content.docume
 from __future__ import annotations
 
 from avis_ctrl.report import html, pdf
-from avis_ctrl.report.pieces import Document
+from avis_ctrl.report.elements import Document
 
 
 def rendered(document: Document) -> tuple[bytes, bytes]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from avis_ctrl.report.elements import Document, Section
 from avis_ctrl.report.method import method
-from avis_ctrl.report.pieces import Document, Section
 from avis_ctrl.report.provenance import document_of
 from avis_ctrl.report.sections.bounds import bounds
 from avis_ctrl.report.sections.controllers import controllers

@@ -12,8 +12,8 @@ import typst
 from markupsafe import Markup
 
 from avis_ctrl.report import plotly_backend
+from avis_ctrl.report.elements import Document, Formula
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Document, Formula
 from avis_ctrl.report.words import typeset
 
 # Typst settings for a page that fits one formula.

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Collection
 from importlib import resources
 
-from avis_ctrl.report.pieces import Bullets, Formula, Heading, Paragraph, Section
+from avis_ctrl.report.elements import Bullets, Formula, Heading, Paragraph, Section
 
 
 def method(report: str, omitted: Collection[str] = (), **values: str) -> Section:

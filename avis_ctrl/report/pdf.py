@@ -13,8 +13,7 @@ import typst
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.report import matplotlib_backend
-from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import (
+from avis_ctrl.report.elements import (
     Bullets,
     Cell,
     Document,
@@ -27,6 +26,7 @@ from avis_ctrl.report.pieces import (
     Piece,
     Table,
 )
+from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.words import typeset
 from avis_ctrl.study.workers import each
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Document, Section, section, table
+from avis_ctrl.report.elements import Document, Section, section, table
 from avis_ctrl.report.settings import SETTINGS
 
 NAMES = {

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from avis_ctrl.measurement.campaign import Campaign, RecordHeader, in_short
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Bullets, Piece, Table, headed, listed
+from avis_ctrl.report.elements import Bullets, Piece, Table, headed, listed
 
 
 def records(campaign: Campaign, use: Mapping[str, str], divided: str) -> Table:

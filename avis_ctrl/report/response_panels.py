@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from avis_ctrl.identification.overlays import MeasuredOverlay
+from avis_ctrl.identification.measured_responses import MeasuredOverlay
 from avis_ctrl.report import words
 from avis_ctrl.report.figures import Axis, Band, Curve, Panel, Style, hertz, log_limits, markers
 from avis_ctrl.report.settings import SETTINGS

@@ -19,7 +19,7 @@ from avis_ctrl.rigs.file_errors import dotted
 from avis_ctrl.rigs.plausible_ranges import RANGES, PlausibleRanges, Range
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import EquationsOfMotion, Modes
-from avis_ctrl.rigs.unit_slips import Entry, G, Place, UnitError, apart, entries, unit_errors
+from avis_ctrl.rigs.unit_errors import Entry, G, Place, UnitError, apart, entries, unit_errors
 
 Content = dict[str, Any]
 Build = Callable[[Content], Rig]

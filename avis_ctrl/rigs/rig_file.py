@@ -1,7 +1,7 @@
 """Rig files: TOML with the data of a rig, checked entry by entry.
 
-There are two kinds: files with [[isolator]] sections give an `AvisTable`, files with [suspension] a `Halcyonics`. The
-keys are documented in docs/rig_file.md.
+There are two kinds: files with [[isolator]] sections give an `IsolatorTable`, files with [suspension] a `Halcyonics`.
+The keys are documented in docs/rig_file.md.
 Each error is one `InputError` line that names file, field, value and what was expected.
 """
 
@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.avis import AvisTable, LinearMotor
 from avis_ctrl.rigs.equipment import Electronics
 from avis_ctrl.rigs.file_errors import read_toml, validated
 from avis_ctrl.rigs.halcyonics import Halcyonics, Load, ReactionMass
+from avis_ctrl.rigs.isolator_table import IsolatorTable, LinearMotor
 from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig_sections import AvisFile, HalcyonicsFile, LoadSection, PlateSection, symbol_of
 from avis_ctrl.rigs.rigid_body import COORDINATES
@@ -29,7 +29,7 @@ SHIPPED = {
 }
 
 
-def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> AvisTable | Halcyonics:
+def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True) -> IsolatorTable | Halcyonics:
     """The rig of a file, or a shipped rig: "avis", "halcyonics", "halcyonics_loaded".
 
     `loaded` puts the load of the file's [load] section on the table. `check` compares the values with those of real
@@ -55,9 +55,9 @@ def load_rig(path_or_name: str | Path, loaded: bool = False, check: bool = True)
         raise error.in_file(path) from None
 
 
-def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcyonics:
+def rig_from(content: dict[str, Any], loaded: bool = False) -> IsolatorTable | Halcyonics:
     """The rig of a file's content; errors as in `load_rig`, without the file's name."""
-    rig: AvisTable | Halcyonics
+    rig: IsolatorTable | Halcyonics
     if "isolator" in content:
         if loaded:
             raise InputError("a table on isolators has no [load] section; use loaded = false", field="load")
@@ -77,7 +77,7 @@ def rig_from(content: dict[str, Any], loaded: bool = False) -> AvisTable | Halcy
     return rig
 
 
-def _check_mass(rig: AvisTable | Halcyonics) -> None:
+def _check_mass(rig: IsolatorTable | Halcyonics) -> None:
     """Check that the mass matrix is finite and numerically positive definite."""
     M = rig.equations_of_motion().M
     if not (np.all(np.isfinite(M)) and np.linalg.eigvalsh(M)[0] > 0):
@@ -86,7 +86,7 @@ def _check_mass(rig: AvisTable | Halcyonics) -> None:
         )
 
 
-def _check_support(rig: AvisTable | Halcyonics) -> None:
+def _check_support(rig: IsolatorTable | Halcyonics) -> None:
     """Check that every motion of the payload stretches a spring: stiffness scaled to unit diagonal is definite."""
     K = rig.equations_of_motion().K
     size = np.sqrt(np.maximum(np.diag(K), np.finfo(float).tiny))
@@ -95,11 +95,11 @@ def _check_support(rig: AvisTable | Halcyonics) -> None:
         most = COORDINATES[int(np.argmax(np.abs(motion)))]
         raise InputError(
             f"expected a positive definite stiffness; no spring resists motion mainly along {most}",
-            field="isolator" if isinstance(rig, AvisTable) else "suspension",
+            field="isolator" if isinstance(rig, IsolatorTable) else "suspension",
         )
 
 
-def _avis(file: AvisFile) -> AvisTable:
+def _avis(file: AvisFile) -> IsolatorTable:
     payload, motors, geophones = file.payload, file.actuators, file.geophones
     lists = {"actuators": (motors, "constant_N_per_V"), "geophones": (geophones, "sensitivity_Vs_per_m")}
     for name, (section, own) in lists.items():
@@ -114,7 +114,7 @@ def _avis(file: AvisFile) -> AvisTable:
     J[0, 1], J[0, 2], J[1, 2] = payload.inertia_offdiagonal_kgm2
     _check_inertia(J + np.triu(J, 1).T, "payload.inertia_kgm2", payload.inertia_kgm2)
     rows = zip(motors.names, motors.isolator, motors.axis, motors.constant_N_per_V, strict=True) if motors else ()
-    table = AvisTable(
+    table = IsolatorTable(
         file.name,
         payload.mass_kg,
         (*payload.inertia_kgm2, *payload.inertia_offdiagonal_kgm2),

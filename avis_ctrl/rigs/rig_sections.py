@@ -7,10 +7,10 @@ from typing import Annotated
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from avis_ctrl.rigs.avis import Isolator
 from avis_ctrl.rigs.equipment import Accelerometers, Acquisition, Ambient, Electronics, Geophones
 from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, FloorSensor, GeophoneAt, PositionSensorAt, Tolerances
+from avis_ctrl.rigs.isolator_table import Isolator
 from avis_ctrl.rigs.key_types import (
     Axis,
     Length,

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs.avis import AXES, INERTIA, AvisTable
 from avis_ctrl.rigs.equipment import Ambient, Electronics
 from avis_ctrl.rigs.file_errors import Section
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.instruments import AccelerometerAt, Drive, GeophoneAt, Instrument, PositionSensorAt
+from avis_ctrl.rigs.isolator_table import AXES, INERTIA, IsolatorTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_sections import LoadSection, PlateSection, SuspensionSection, symbol_of
 from avis_ctrl.rigs.toml_text import toml_value
@@ -55,7 +55,7 @@ def rig_toml(rig: Rig, comments: Mapping[str, str] | None = None, header: str = 
     """
     sections = _sections(rig)
     if not sections:
-        raise InputError("expected an AvisTable or a Halcyonics rig", field="rig", value=type(rig).__name__)
+        raise InputError("expected an IsolatorTable or a Halcyonics rig", field="rig", value=type(rig).__name__)
     left = dict(comments or {})
     text = "".join(_comment(line) + "\n" for line in header.splitlines())
     for title, name, lines in sections:
@@ -82,7 +82,7 @@ def file_keys(rig: Rig) -> dict[str, str]:
 
 
 def _sections(rig: Rig) -> list[_Section]:
-    if isinstance(rig, AvisTable):
+    if isinstance(rig, IsolatorTable):
         return _avis_sections(rig)
     return _halcyonics_sections(rig) if isinstance(rig, Halcyonics) else []
 
@@ -107,7 +107,7 @@ def _sum_for(parts: Iterable[float], bases: Iterable[float]) -> list[float]:
     return sums
 
 
-def _avis_sections(rig: AvisTable) -> list[_Section]:
+def _avis_sections(rig: IsolatorTable) -> list[_Section]:
     sections: list[_Section] = [
         ("", "", [_Line("name", rig.name)]),
         (

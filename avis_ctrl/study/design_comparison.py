@@ -10,7 +10,7 @@ from typing import Any
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs.file_errors import read_json
-from avis_ctrl.study.saved import STUDY
+from avis_ctrl.study.study_file import STUDY
 from avis_ctrl.summary import html_table, in_short
 
 RESULT = "result.json"

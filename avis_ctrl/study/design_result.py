@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 
 from avis_ctrl.lti.statespace import StateSpace
+from avis_ctrl.rigs.reduction_error import ReductionError
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.robust.mu_peak import MuPeak
-from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import SimulationCheck
-from avis_ctrl.study.at_rest import AtRest
-from avis_ctrl.study.companions import Companions
+from avis_ctrl.simulation.instability_cause import InstabilityCause
+from avis_ctrl.study.dc_gain import AtRest
 from avis_ctrl.study.design_file import Design
+from avis_ctrl.study.other_axes import Companions
 from avis_ctrl.study.plant import DesignPlant
 
 ControllerKind = Literal["mu", "hinf", "skyhook", "passive"]
@@ -147,7 +147,7 @@ class Simulated:
     check: SimulationCheck
     digital: StateSpace
     delay_samples: float
-    culprit: Culprit | None
+    culprit: InstabilityCause | None
     rest: AtRest | None = None
 
 

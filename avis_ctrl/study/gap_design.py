@@ -1,4 +1,4 @@
-"""Influence of named effects on the controller: the previous controller on the updated model, and a new controller.
+"""Influence of named effects on the controller: the one of the re-identified model, on the updated one, and a new one.
 
 As in `avis design`, every figure is computed from a closed loop in state space: mu and worst-case gains are bounds over
 all frequencies and the whole uncertainty of the design; stability follows from the eigenvalues. The figures are valid
@@ -23,7 +23,7 @@ from avis_ctrl.gap.result import Gap
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.lti.norms import decibels, hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
-from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
 from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
@@ -77,9 +77,9 @@ class DesignEffect:
 
     Attributes
     ----------
-    before : the previous controller on the baseline. after : the same controller on the updated model; None if no named
-        effect changes the model. new : a controller designed for the updated model, on this model; None if none was
-        found.
+    before : the controller designed on the baseline, with the baseline. after : the same controller on the updated
+        model; None if no named effect changes the model. new : a controller designed for the updated model, on this
+        model; None if none was found.
     K_before, K_new : the controllers.
     realised : the updated model in state space, with its difference from the fitted response.
     in_files, not_in_files : labels of the effects that rig.toml and design.toml contain, and of those they do not.
@@ -229,7 +229,7 @@ def compare_designs(
 def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
     """The design that `design_effect` uses on a rig. Raises InputError as it does, before any computation."""
     if design is None:
-        if not isinstance(rig, AvisTable):
+        if not isinstance(rig, IsolatorTable):
             raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
         keep = " and ".join(default_keep(rig))
         return default_design(
@@ -303,13 +303,14 @@ def _outcome(
     """mu of the three loops in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
     if after is None:
         return [
-            f"The controller designed on the re-identified model has mu {before.mu_upper:.3g} there; no named effect "
+            f"The controller designed on the re-identified model has mu of at most {before.mu_upper:.3g} there; no "
+            "named effect "
             "changes the model, so nothing else was computed."
         ]
-    first = f"The previous controller has mu {before.mu_upper:.3g} on the re-identified model and "
+    first = f"The controller designed on the re-identified model has mu of at most {before.mu_upper:.3g} there and "
     if after.stable:
         verdict = f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}"
-        first += f"{after.mu_upper:.3g} on the updated model: {verdict}."
+        first += f"of at most {after.mu_upper:.3g} on the updated model: {verdict}."
     else:
         first += "makes the updated model unstable."
     if after.stable and before.stable_in_six and not after.stable_in_six:
@@ -322,7 +323,9 @@ def _outcome(
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
-    second = f"A controller designed on the updated model has mu {new.mu_upper:.3g} there and {reach} ({bounds})."
+    second = (
+        f"A controller designed on the updated model has mu of at most {new.mu_upper:.3g} there and {reach} ({bounds})."
+    )
     if target and after.mu_upper < new.mu_upper < 1:
         second += f" Synthesis stops near its target of {target:g}: it does not search for the lowest mu."
     return [first, second if new.stable_in_six else f"{second} With all six coordinates the loop is unstable."]

@@ -17,7 +17,7 @@ from avis_ctrl.files import write_together
 from avis_ctrl.gap import line_response
 from avis_ctrl.gap.model_files import model_to_dict, read_model
 from avis_ctrl.gap.result import Gap
-from avis_ctrl.gap.signals.repair import channel_limits
+from avis_ctrl.gap.signals.declipping import channel_limits
 from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, inseparable_parameters
 from avis_ctrl.identification.parameter_sets import default_parameters

@@ -18,9 +18,9 @@ from avis_ctrl.gap.simulation import simulate
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.identification.campaign_fit import driven_inputs, excited_band
+from avis_ctrl.identification.measured_responses import SETTINGS as OVERLAY
+from avis_ctrl.identification.measured_responses import MeasuredOverlay, thinned
 from avis_ctrl.identification.model_error import SETTINGS as MODEL_ERROR
-from avis_ctrl.identification.overlays import SETTINGS as OVERLAY
-from avis_ctrl.identification.overlays import MeasuredOverlay, thinned
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation

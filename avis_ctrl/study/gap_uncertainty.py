@@ -118,11 +118,11 @@ class FitUncertainty:
             f"All loops include the uncertainty of the {self.n_parameters} fitted parameters at "
             f"{_percent(self.confidence)}: {blocks}. "
             "For later changes of the table, give a design with ranges.",
-            f"Not in the loops: combinations of parameters that change the response to the drives by at most "
-            f"{_percent(own['left_out_drives'])}{share} and that to the floor by at most "
-            f"{_percent(own['left_out_floor'])}; second-order terms, {_percent(own['products'])} in random "
-            f"samples; changes through sensors, effects and locked coordinates, at most "
-            f"{_percent(own['not_in_equations'])}. Effects that depend on amplitude are not counted.",
+            "The loops omit combinations of parameters that change the response to the drives by at most "
+            f"{_percent(own['left_out_drives'])}{share} and the response to the floor by at most "
+            f"{_percent(own['left_out_floor'])}. They also omit second-order terms ({_percent(own['products'])} in "
+            "random samples) and changes through sensors, effects and locked coordinates (at most "
+            f"{_percent(own['not_in_equations'])}). These figures do not include effects that depend on amplitude.",
         )
 
 

@@ -16,18 +16,22 @@ from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.simulation.campaign_data import Progress, SensorChange, open_loop
 from avis_ctrl.simulation.campaign_plan import CampaignPlan, EffectPlan
-from avis_ctrl.simulation.rehearsal import Rehearsal, rehearse
+from avis_ctrl.simulation.perturbed_campaign import PerturbedCampaign, perturbed_campaign
 
 
-def rehearse_with_effects(rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None) -> Rehearsal:
+def campaign_with_effects(
+    rig: Rig, plan: CampaignPlan, seed: int = 1, progress: Progress | None = None
+) -> PerturbedCampaign:
     """The campaign of a plan, simulated with its effects on the perturbed table.
 
-    Raises as `rehearse` and `hidden_effects`.
+    Raises as `perturbed_campaign` and `hidden_effects`.
     """
     if not plan.effect:
-        return rehearse(rig, plan, seed, progress)
+        return perturbed_campaign(rig, plan, seed, progress)
     corner = open_loop(rig, plan).amplifier_corner_Hz
-    return rehearse(rig, plan, seed, progress, partial(hidden_effects, plan.effect, amplifier_corner_Hz=corner))
+    return perturbed_campaign(
+        rig, plan, seed, progress, partial(hidden_effects, plan.effect, amplifier_corner_Hz=corner)
+    )
 
 
 def hidden_effects(plans: Sequence[EffectPlan], truth: Rig, amplifier_corner_Hz: float | None = None) -> SensorChange:

@@ -13,10 +13,10 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
 from avis_ctrl.identification.model_error import measured_response
-from avis_ctrl.identification.spread import FrfSpread, frf_spread
+from avis_ctrl.identification.response_error import FrfSpread, frf_spread
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.rigs.logical_axes import drivable, sensed
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig
@@ -177,7 +177,7 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
 
     parameters_percent : ranges of the rig's parameters; by default none, because an identification provides them.
     """
-    shape = _AVIS if isinstance(rig, AvisTable) else _HALCYONICS
+    shape = _AVIS if isinstance(rig, IsolatorTable) else _HALCYONICS
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
     # A quarter of the sample rate: the hold distorts faster poles.
     fastest = {"quantity": "fastest_controller_pole_Hz", "at_most": rig.sample_rate_Hz / 4}
@@ -187,7 +187,7 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
 
 def assumed_weights(rig: Rig) -> str:
     """Comment lines above a `default_design`: the table for which its weights were chosen, compared with this one."""
-    shipped = load_rig("avis" if isinstance(rig, AvisTable) else "halcyonics_loaded")
+    shipped = load_rig("avis" if isinstance(rig, IsolatorTable) else "halcyonics_loaded")
     lines = [
         "No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
         "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:",

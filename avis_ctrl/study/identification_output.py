@@ -18,8 +18,8 @@ from avis_ctrl.identification.predictor import Predictor, model_inputs
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.measurement.campaign import Campaign, ranges
 from avis_ctrl.measurement.formats.hdf5_writing import replacing
-from avis_ctrl.rigs.avis import AvisTable
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import load_rig, rig_from
 from avis_ctrl.rigs.rig_writer import rig_toml
@@ -47,7 +47,7 @@ def identified_rig(model: ResponseModel) -> Rig:
     sensitive = [name for name in model.names if name.startswith("sensor.")]
     if not sensitive and "loop_delay_s" not in model.names:
         return rig
-    if not isinstance(rig, AvisTable):
+    if not isinstance(rig, IsolatorTable):
         raise InputError(
             "a rig file of this kind has one sensitivity and one delay for all; leave them out",
             field="parameters",

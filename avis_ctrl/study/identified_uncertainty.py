@@ -9,7 +9,7 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.directions import Directions, directions_that_matter
-from avis_ctrl.identification.spread import FrfSpread
+from avis_ctrl.identification.response_error import FrfSpread
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.study.uncertainty_file import UncertaintyFile
 from avis_ctrl.uncertainty.identified_spread import IdentifiedSpread, covering_spread

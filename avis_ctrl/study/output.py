@@ -15,7 +15,7 @@ from avis_ctrl.lti.norms import decibels
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult, FailedController, Simulated
 from avis_ctrl.study.files import as_json, values_of
-from avis_ctrl.study.saved import STUDY, study_dict
+from avis_ctrl.study.study_file import STUDY, study_dict
 from avis_ctrl.study.verdict import first_sentence
 
 FILES = STUDY, "plant.json", "sampled_controller.json", "report.html", "report.pdf", "result.json"

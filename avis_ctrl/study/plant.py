@@ -20,7 +20,7 @@ from avis_ctrl.lti.connect import summing_junction
 from avis_ctrl.lti.rational import cascade
 from avis_ctrl.lti.realisation import with_rate_input
 from avis_ctrl.lti.statespace import StateSpace, gain
-from avis_ctrl.rigs.actuator import pade_delay
+from avis_ctrl.rigs.delay_models import pade_delay
 from avis_ctrl.rigs.floor_spectrum import SpectrumModel, shipped_spectrum
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig import Rig
@@ -239,18 +239,18 @@ def floor_spectrum(design: Design, rig: Rig) -> SpectrumModel:
 OF_AXES = {
     "floor_{}_dot": ("velocity of the floor", "m/s"),
     "{}_dot": ("velocity of the payload", "m/s"),
-    "{}_rel": ("displacement of the payload against the floor", "m"),
+    "{}_rel": ("displacement of the payload relative to the floor", "m"),
     "force_{}": ("force on the payload", "N"),
     "command_{}": ("force commanded by the controller", "N"),
     "drive_{}": ("commanded force after delay and amplifier", "N"),
-    "clean_{}_dot": ("velocity as the sensors' band shows it", "m/s"),
-    "{}_in_space": ("velocity as the sensors' band shows it", "m/s"),
-    "{}_against_chassis": ("velocity as the sensors' band shows it", "m/s"),
+    "clean_{}_dot": ("velocity within the sensor band", "m/s"),
+    "{}_in_space": ("velocity within the sensor band", "m/s"),
+    "{}_against_chassis": ("velocity within the sensor band", "m/s"),
     "seen_{}_dot": ("measured velocity", "m/s"),
-    "chain_error_{}": ("what neglected sensor dynamics add to the velocity", "m/s"),
-    "e_{}": ("payload velocity over its bound", "1"),
-    "effort_{}": ("drive over its limit", "1"),
-    "compliance_{}": ("displacement over its bound", "1"),
+    "chain_error_{}": ("contribution of neglected sensor dynamics to the velocity", "m/s"),
+    "e_{}": ("payload velocity relative to its bound", "1"),
+    "effort_{}": ("drive voltage relative to its limit", "1"),
+    "compliance_{}": ("displacement relative to its bound", "1"),
 }
 OF_NOISES = {
     "mixed_noise_{}": ("noise of the sensors used for this axis, before its filter", "1"),

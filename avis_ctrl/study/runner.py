@@ -14,14 +14,15 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.errors import ComputationError
+from avis_ctrl.rigs.reduction_error import reduction_error
 from avis_ctrl.rigs.rig import Rig
-from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn import DKIteration
 from avis_ctrl.robust.musyn_state import GIVEN, HINF, NOMINAL
 from avis_ctrl.study.analysis import SETTINGS as ANALYSIS
 from avis_ctrl.study.analysis import analyse, worst_of_axis
-from avis_ctrl.study.at_rest import at_rest
 from avis_ctrl.study.controllers import best_of, mu_optimal, nominal_hinf, passive
+from avis_ctrl.study.dc_gain import at_rest
+from avis_ctrl.study.decentralised import LOOPS_TITLE, tuned_loops
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import (
     AxisGain,
@@ -31,8 +32,7 @@ from avis_ctrl.study.design_result import (
     FailedController,
     Simulated,
 )
-from avis_ctrl.study.limits import best_found, limiting
-from avis_ctrl.study.loops import LOOPS_TITLE, tuned_loops
+from avis_ctrl.study.limiting_bounds import best_found, limiting
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.provenance import provenance
 from avis_ctrl.study.random_plants import random_perturbations
@@ -102,7 +102,7 @@ def run_design(
 INITIAL = {
     HINF: "H-infinity, uncertainty as performance",
     NOMINAL: "H-infinity, nominal plant",
-    GIVEN: "from the comparison",
+    GIVEN: "controller for comparison",
 }
 # Steps other than those of D-K iteration, by their kind.
 STEPS = {
@@ -173,7 +173,7 @@ def synthesise(
         else:
             progress(
                 f"step {row.iteration}, {STEPS.get(row.kind, 'D-K iteration')}: gamma {row.gamma:.5g}, {reached}, "
-                f"misfit of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
+                f"fit error of the D-scalings {100 * row.d_fit_error:.0f} %, {row.seconds:.1f} s"
             )
         return not ends
 

@@ -15,16 +15,16 @@ from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.mu_realise import realise_delta
 from avis_ctrl.robust.mu_scan import refine_maxima
-from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.design_check import check_designs
 from avis_ctrl.simulation.discrete import digital_controller
+from avis_ctrl.simulation.instability_cause import find_cause
 from avis_ctrl.simulation.sampled_loop import SampledLoop, lever_arms, rig_bank
 from avis_ctrl.simulation.sampled_response import predict_transmissibility_6dof
-from avis_ctrl.study.at_rest import at_rest
-from avis_ctrl.study.companions import Companions, design_companions, until_stable
+from avis_ctrl.study.dc_gain import at_rest
 from avis_ctrl.study.design_file import Design
 from avis_ctrl.study.design_result import ControllerResult, Simulated, SixDofCheck
 from avis_ctrl.study.identified_uncertainty import RESPONSE
+from avis_ctrl.study.other_axes import Companions, design_companions, until_stable
 from avis_ctrl.study.plant import DesignPlant
 from avis_ctrl.study.random_plants import random_perturbations
 
@@ -55,7 +55,7 @@ def simulate_study(design: Design, rig: Rig, plant: DesignPlant, result: Control
         check,
         digital_controller(nominal),
         nominal.loop_delay_s * nominal.sample_rate_Hz,
-        find_culprit(unstable[0]) if unstable else None,
+        find_cause(unstable[0]) if unstable else None,
         rest,
     )
 

@@ -17,7 +17,7 @@ from pydantic import Field, model_validator
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.spread import FrfSpread
+from avis_ctrl.identification.response_error import FrfSpread
 from avis_ctrl.rigs.file_errors import Section, read_json, validated
 from avis_ctrl.rigs.key_types import NotNegative, Number, Positive
 from avis_ctrl.rigs.rig import Rig

@@ -11,10 +11,10 @@ from avis_ctrl.lti.norms import decibels
 from avis_ctrl.rigs.rigid_body import COORDINATES
 from avis_ctrl.robust.musyn_iteration import STOPPED
 from avis_ctrl.simulation.design_check import SimulationCheck
-from avis_ctrl.study.at_rest import AtRest
+from avis_ctrl.study.dc_gain import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
 from avis_ctrl.study.design_result import AxisGain, ControllerResult, DesignResult, Requirement
-from avis_ctrl.study.limits import no_better_than_none
+from avis_ctrl.study.limiting_bounds import no_better_than_none
 from avis_ctrl.summary import digits_apart, joined
 
 

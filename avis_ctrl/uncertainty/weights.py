@@ -69,8 +69,9 @@ class TransmissibilityBound(Weight):
         low, high = self.band_Hz
         return (
             f"transmissibility at most {self.peak_dB:+g} dB, at most {self.band_dB:+g} dB from {low:g} to {high:g} Hz; "
-            f"realised with {self.shape.order} states, stricter than this bound by up to {self.tolerance_dB:g} dB, and "
-            f"by more within {self.transition_octaves:g} octave of a stricter band"
+            f"realised with {self.shape.order} states; up to {self.tolerance_dB:g} dB stricter than these bounds, "
+            "and possibly "
+            f"more within {self.transition_octaves:g} octave of the edges of the band"
         )
 
 
@@ -91,7 +92,7 @@ class ComplianceBound(Weight):
 
 @dataclass(frozen=True)
 class ControlEffort(Weight):
-    """Voltage of an actuator: at most its limit if the disturbance has the expected level.
+    """Voltage of an actuator: at most its limit if the floor has the expected velocity.
 
     W = (level / limit) (s/wb + 1)/(s/(R wb) + 1): up to wb the full limit may be used, far above it only the fraction
     1/R, so that the controller rolls off. Below a corner w0, W is larger by the factor (s + k w0)/(s + w0),
@@ -100,7 +101,7 @@ class ControlEffort(Weight):
     Parameters
     ----------
     limit_V : actuator limit.
-    disturbance_level : disturbance, in the unit of the plant's disturbance input, that may use the full limit.
+    floor_velocity_m_per_s : floor velocity (of the table's edge for rotations) that may use the full limit.
     bandwidth_Hz : wb.
     reduction : R > 1, factor by which the allowed voltage is smaller far above wb.
     offset, offset_corner_Hz : constant offset of the same input, relative to its unit, 0 for none; it may drift with
@@ -108,7 +109,7 @@ class ControlEffort(Weight):
     """
 
     limit_V: float
-    disturbance_level: float
+    floor_velocity_m_per_s: float
     bandwidth_Hz: float
     reduction: float
     offset: float
@@ -116,22 +117,25 @@ class ControlEffort(Weight):
 
     @cached_property
     def shape(self) -> Rational:
-        gain, w0 = self.disturbance_level / self.limit_V, 2 * np.pi * self.offset_corner_Hz
+        gain, w0 = self.floor_velocity_m_per_s / self.limit_V, 2 * np.pi * self.offset_corner_Hz
         zeros, poles = ((w0 * np.hypot(1, self.offset),), (w0,)) if self.offset else ((), ())
         wb = 2 * np.pi * self.bandwidth_Hz
         return Rational(gain * self.reduction, real_zeros=(*zeros, wb), real_poles=(*poles, self.reduction * wb))
 
     @property
     def meaning(self) -> str:
-        text = f"at most {self.limit_V:g} V when the disturbance has the level {self.disturbance_level:.3g}"
-        if self.offset:
-            text += (
-                f"; {np.hypot(1, self.offset):.3g} times stricter below {self.offset_corner_Hz:g} Hz, for the "
-                "offset of the electronics"
-            )
+        text = (
+            f"at most {self.limit_V:g} V for a floor velocity of {self.floor_velocity_m_per_s:.3g} m/s, up to "
+            f"{self.bandwidth_Hz:g} "
+            f"Hz; above that the permitted voltage falls at 20 dB per decade to {1 / self.reduction:.2g} times this "
+            "value"
+        )
+        if not self.offset:
+            return text
         return (
-            f"{text} up to {self.bandwidth_Hz:g} Hz, falling at 20 dB per decade to a fraction "
-            f"{1 / self.reduction:.2g} of it"
+            f"{text}; below {self.offset_corner_Hz:g} Hz it is {np.hypot(1, self.offset):.3g} times smaller, because "
+            "of "
+            "the offset of the electronics"
         )
 
 

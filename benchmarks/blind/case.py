@@ -26,7 +26,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.rigs import AvisTable, load_rig
+from avis_ctrl.rigs import IsolatorTable, load_rig
 
 # A traceback is kept from its end, where the reason is.
 LONGEST_TEXT = 4000
@@ -93,7 +93,7 @@ def _work(task: Task, to_parent: Connection) -> None:
             to_parent.send(("unseen", {"unseen_error": traceback.format_exc()[-LONGEST_TEXT:]}))
 
 
-def _ask(finder: Any, campaign: Campaign, rig: AvisTable, to_parent: Connection) -> Any:
+def _ask(finder: Any, campaign: Campaign, rig: IsolatorTable, to_parent: Connection) -> Any:
     """The finding, or None after a crash."""
     memory = PeakMemory()
     cpu, began = cpu_seconds(), time.perf_counter()

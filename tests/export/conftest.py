@@ -8,16 +8,16 @@ import pytest
 
 from avis_ctrl.export.compiled import compiler
 from avis_ctrl.export.design_folder import open_design
-from avis_ctrl.study.companions import design_companions
 from avis_ctrl.study.controllers import mu_optimal
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.files import as_json
+from avis_ctrl.study.other_axes import design_companions
 from avis_ctrl.study.output import controller_dict
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.runner import design_provenance
-from avis_ctrl.study.saved import study_dict
 from avis_ctrl.study.simulation import bare_loop
 from avis_ctrl.study.skyhooks import classical_skyhook
+from avis_ctrl.study.study_file import study_dict
 
 DESIGNS = Path(__file__).resolve().parents[2] / "designs"
 

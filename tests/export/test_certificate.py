@@ -17,11 +17,11 @@ from avis_ctrl.export.bounds import StabilityNotProvedError, bounds
 from avis_ctrl.export.c_source import Provenance, c_files
 from avis_ctrl.export.certificate import certify, shipped_loop
 from avis_ctrl.export.compiled import CompiledController
+from avis_ctrl.export.compiled_simulation import CompiledSimulationSettings, simulate_worst_plant
 from avis_ctrl.export.design_folder import Added, open_design
 from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
 from avis_ctrl.export.package import CERTIFICATE, CONTINUOUS, CONTROLLER, check_package, make_package
 from avis_ctrl.export.protection import Processor, protection
-from avis_ctrl.export.replay import ReplaySettings, replay_worst_plant
 from avis_ctrl.export.rounding import rounding_noise
 from avis_ctrl.export.sampled_controller import parse_controller
 from avis_ctrl.export.sampled_response import SampledAxes
@@ -200,8 +200,8 @@ def test_offset_at_the_inputs_costs_the_voltage_that_is_certified(shipped, packa
 def louder(shipped, package, gcc):
     """The replay with ten times the floor motion, beside which the same noise is a tenth as large."""
     files = {name: data.decode() for name, data in package.contents.items() if name.startswith("avis_controller.")}
-    settings = ReplaySettings(velocity_rms=10 * ReplaySettings().velocity_rms)
-    return replay_worst_plant(shipped, package.certificate, package.controller, files, settings)
+    settings = CompiledSimulationSettings(velocity_rms=10 * CompiledSimulationSettings().velocity_rms)
+    return simulate_worst_plant(shipped, package.certificate, package.controller, files, settings)
 
 
 def test_the_worst_plant_replayed_through_the_code(package, louder, gcc):

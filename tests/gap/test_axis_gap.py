@@ -13,7 +13,7 @@ from avis_ctrl.cli.gap_axis import gap_axis
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis import Signals, analysis, find_axis_gap, find_axis_gap_in
 from avis_ctrl.gap.axis.find import Reading, signals_in
-from avis_ctrl.gap.axis.levels import level_effects
+from avis_ctrl.gap.axis.level_dependence import level_effects
 from avis_ctrl.gap.axis.mass_effects import Scale, drive_effects, oscillator_effects
 from avis_ctrl.gap.axis.model import Effect, Parameter
 from avis_ctrl.gap.axis.search import Explored

@@ -21,7 +21,7 @@ from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.nonlinear import payload_acceleration, rig_arrays
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
-from avis_ctrl.simulation.rehearsal import perturbed_truth
+from avis_ctrl.simulation.perturbed_campaign import perturbed_truth
 
 RIG = load_rig("avis")
 BARE = TableModel(ResponseModel.of(RIG, ()))

@@ -13,7 +13,7 @@ from signal_campaigns import LSB, convert, draw, rig
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.converter import inspect_converter
-from avis_ctrl.gap.signals.repair import repair
+from avis_ctrl.gap.signals.declipping import repair
 from avis_ctrl.measurement.campaign import Campaign, Record, RecordHeader
 
 SHORT = 20_000

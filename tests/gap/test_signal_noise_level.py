@@ -12,7 +12,7 @@ from signal_campaigns import LSB, draw, hum, rig
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.signals.hum import find_hum
 from avis_ctrl.gap.signals.noise_level import NoiseLevels, noise_levels
-from avis_ctrl.gap.signals.quiet_lines import quiet_lines
+from avis_ctrl.gap.signals.noise_lines import quiet_lines
 from avis_ctrl.gap.signals.record_residual import record_residuals
 from avis_ctrl.identification.response import ResponseModel
 

@@ -3,9 +3,9 @@
 import pytest
 
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 
 
 @pytest.fixture(scope="session")
-def avis() -> AvisTable:
+def avis() -> IsolatorTable:
     return load_rig("avis")

@@ -12,11 +12,11 @@ from numba import njit
 
 from avis_ctrl.lti.statespace import append
 from avis_ctrl.measurement.campaign import Record, RecordHeader
-from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.simulation.sampled_loop import rig_bank
 
 
-def discrete_avis(rig: AvisTable, period_s: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def discrete_avis(rig: IsolatorTable, period_s: float = 1e-3) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """A, B, C, D from (8 volts, floor velocity of 6 coordinates), both held over a period, to the sensors' volts."""
     chains = append(*[chain.renamed([f"in{k}"], [f"out{k}"]) for k, chain in enumerate(rig_bank(rig, 1.0).chains)])
     table, R = rig.equations_of_motion().state_space(), rig.sensor_rows()[1]
@@ -68,7 +68,7 @@ def floor_velocity(rng: np.random.Generator, samples: int, rms: float = 2e-6) ->
 
 
 def record(
-    rig: AvisTable,
+    rig: IsolatorTable,
     u: np.ndarray,
     floor: np.ndarray,
     rng: np.random.Generator,

@@ -12,7 +12,7 @@ from avis_ctrl.identification.identifiability import identifiability_report
 from avis_ctrl.identification.information import Information
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.identification.sparse_space import components, reduced_rows, sparse_rows, whole_numbers
-from avis_ctrl.identification.structure import structural_null_space
+from avis_ctrl.identification.structural_identifiability import structural_null_space
 from avis_ctrl.rigs import load_rig
 
 MOUNTS = [f"isolator{i}.{kind}_{axis}" for i in (1, 2, 3, 4) for kind in "kc" for axis in "xyz"]

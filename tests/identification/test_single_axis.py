@@ -127,7 +127,7 @@ def test_wrong_input_of_a_drive_is_named(rng, change, expected):
 
 def test_a_drive_that_never_moved_is_refused(rng):
     t, q, force, _ = simulated_drive(rng)
-    with pytest.raises(ComputationError, match="the data hold nothing of M"):
+    with pytest.raises(ComputationError, match="the data contain no information on M"):
         fit_drive(t, 0 * q, force)
 
 

@@ -14,9 +14,9 @@ from scipy.signal import dlsim
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.identification.campaign_fit import excited_band, fit_campaign
 from avis_ctrl.identification.maximum_likelihood import Residual
+from avis_ctrl.identification.measured_responses import overlay
 from avis_ctrl.identification.modes import measured_modes, mode_table, model_modes
 from avis_ctrl.identification.noise import noise_from_residuals
-from avis_ctrl.identification.overlays import overlay
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError, interval, prediction_error
 from avis_ctrl.identification.response import ResponseModel

@@ -15,10 +15,10 @@ from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.report.content import document as design_document
 from avis_ctrl.report.gap.content import document as gap_document
 from avis_ctrl.report.identification.content import document as identification_document
+from avis_ctrl.rigs.reduction_error import reduction_error
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.robust.musyn_state import Iteration
-from avis_ctrl.simulation.rehearsal import rehearse
+from avis_ctrl.simulation.perturbed_campaign import perturbed_campaign
 from avis_ctrl.study.design_file import read_design
 from avis_ctrl.study.design_result import (
     Bound,
@@ -153,7 +153,7 @@ def fabricated() -> DesignResult:
 def identified() -> Identification:
     """A small campaign: three records of noise and one at rest."""
     rig = load_rig("avis")
-    campaign = rehearse(rig, plan_from_table(PLAN), seed=2).campaign
+    campaign = perturbed_campaign(rig, plan_from_table(PLAN), seed=2).campaign
     return identify(campaign, rig, IdentifyOptions(parameters=FREE, starts=1, despite_gates=True))
 
 

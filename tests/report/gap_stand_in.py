@@ -239,7 +239,8 @@ def with_verdict(gap: Gap, verdict: str) -> Gap:
 
 
 def design() -> DesignEffect:
-    """The previous controller, which the effect spoils, and a new one; without the controllers themselves."""
+    """The controller designed without the effect, which the effect spoils, and a new one; without the controllers "
+    "themselves."""
     nothing: Any = None
     return DesignEffect(
         LoopFigures(True, True, 0.95, 0.94, 3.1, -12.0, 5.2, -9.1, 60.0),
@@ -252,7 +253,8 @@ def design() -> DesignEffect:
         ("com_offset@payload",),
         {},
         (
-            "The previous controller has mu 0.95 on the re-identified model and 1.32 on the updated model.",
+            "The controller designed on the re-identified model has mu of at most 0.95 on this model and of at most "
+            "1.32 on the updated model.",
             "A controller designed on the updated model has mu 0.97 there.",
         ),
         30.0,

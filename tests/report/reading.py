@@ -11,8 +11,8 @@ from html.parser import HTMLParser
 import pytest
 
 from avis_ctrl.report import html, pdf
+from avis_ctrl.report.elements import Document, Mark, Paragraph, Section, Table
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Document, Mark, Paragraph, Section, Table
 
 HOSTILE = '</script><script>alert(1)</script> <b>x</b> #panic("y") $ *z* {{ 7*7 }} \\ & "'
 

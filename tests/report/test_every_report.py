@@ -10,10 +10,10 @@ from reading import HOSTILE, Reader, Written, cells, pdf_text, tables, written
 
 from avis_ctrl.measurement.gates.finding import Finding
 from avis_ctrl.report.content import document as design_document
+from avis_ctrl.report.elements import Document
 from avis_ctrl.report.figures import Figure
 from avis_ctrl.report.gap.content import document as gap_document
 from avis_ctrl.report.identification.content import document as identification_document
-from avis_ctrl.report.pieces import Document
 
 RESULTS = {
     "design": (design_document, "fabricated"),

@@ -17,13 +17,13 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import VERDICTS, Detectable, HeatMap, Stage, Where, spoken
 from avis_ctrl.gap.table_model import active
 from avis_ctrl.report import html, words
+from avis_ctrl.report.elements import Mark, Paragraph, Section
 from avis_ctrl.report.figures import Figure, Heat, Panel
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import spectrum, worst_pairs
 from avis_ctrl.report.gap.content import document
 from avis_ctrl.report.gap.places import heat_map
 from avis_ctrl.report.matplotlib_backend import svg
-from avis_ctrl.report.pieces import Mark, Paragraph, Section
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.study.gap_overlay import GapOverlay, gap_overlay, selections
 
@@ -356,7 +356,14 @@ def test_controller_only_where_there_is_one(found):
     )
     own = section(replace(found, design=replace(found.design, before=lost, after=None, new=None)), "controller")
     assert tables(own)[0].rows == (
-        ("previous", "re-identified", Mark("no", False), Mark("yes", True), Mark("no bound", False), *["no bound"] * 4),
+        (
+            "re-identified",
+            "re-identified",
+            Mark("no", False),
+            Mark("yes", True),
+            Mark("no bound", False),
+            *["no bound"] * 4,
+        ),
     )
     drawn = figures(own)["gap_mu"]
     assert "not proved" in drawn.caption and svg(drawn).startswith("<?xml")

@@ -16,12 +16,12 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.measurement.gates.finding import Finding, Limit, Picture, Series
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Fold, Mark, Paragraph, Section
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style
 from avis_ctrl.report.identification.content import document
 from avis_ctrl.report.identification.gates import figure_of
 from avis_ctrl.report.identification.responses import strongest
 from avis_ctrl.report.matplotlib_backend import svg
-from avis_ctrl.report.pieces import Fold, Mark, Paragraph, Section
 from avis_ctrl.report.plotly_backend import graph
 from avis_ctrl.study.identification import Identification
 

@@ -10,8 +10,8 @@ import pytest
 from reading import Reader, Written, pdf_text, written
 
 from avis_ctrl.report.content import document
+from avis_ctrl.report.elements import Mark, Paragraph, Table, table
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Mark, Paragraph, Table, table
 from avis_ctrl.study.design_result import Bound, DesignResult
 
 

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from avis_ctrl.report.pieces import Table
+from avis_ctrl.report.elements import Table
 from avis_ctrl.report.sections.rig import rig as section
+from avis_ctrl.rigs.reduction_error import reduction_error
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.rigs.subsystem import reduction_error
 from avis_ctrl.study.identification_design import default_design
 
 RIGS = Path(__file__).parents[2] / "designs" / "rigs"

@@ -9,12 +9,12 @@ import pytest
 
 from avis_ctrl.lti.statespace import gain
 from avis_ctrl.report.content import document
+from avis_ctrl.report.elements import Mark, Table
 from avis_ctrl.report.figures import Figure
-from avis_ctrl.report.pieces import Mark, Table
 from avis_ctrl.report.sections.simulation import simulation
 from avis_ctrl.simulation.design_check import check_designs
-from avis_ctrl.study.companions import Companion, Companions
 from avis_ctrl.study.design_result import DesignResult, Simulated
+from avis_ctrl.study.other_axes import Companion, Companions
 from avis_ctrl.study.output import result_dict
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
@@ -74,7 +74,7 @@ def test_each_axis_is_weighed_against_the_drive_that_reaches_its_limit_first(lim
         # At 5 Hz, between the corners for the offset and for the bandwidth.
         gain = abs(plant.full.P.select([f"effort_{axis}"], [f"command_{axis}"])(10j * np.pi)[0, 0])
         assert gain == pytest.approx(level * np.max(np.abs(plant.allocation[:, k]) / limits), rel=5e-3)
-        assert plant.effort_weight(axis).meaning.startswith("at most 4 V when")
+        assert plant.effort_weight(axis).meaning.startswith("at most 4 V for a floor velocity")
     curves = (
         next(
             p

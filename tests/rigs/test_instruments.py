@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import hinf_norm
-from avis_ctrl.rigs.actuator import pade_delay, zero_order_hold
 from avis_ctrl.rigs.converter import Converter, quantise
+from avis_ctrl.rigs.delay_models import pade_delay, zero_order_hold
 
 AVIS_CONVERTER = Converter(14, 10.0, 1000.0)
 

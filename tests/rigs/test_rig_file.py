@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import avis_ctrl.rigs.rig_file as rig_file
 from avis_ctrl.errors import InputError
-from avis_ctrl.rigs import AvisTable, Halcyonics, load_rig
+from avis_ctrl.rigs import Halcyonics, IsolatorTable, load_rig
 
 DATA = Path(rig_file.__file__).parent / "data"
 SOURCES = {name: (DATA / f"{name}.toml").read_text(encoding="utf-8") for name in ("avis", "halcyonics")}
@@ -34,7 +34,7 @@ def test_shipped_numbers_are_those_of_the_shared_files(name, shared):
 
 
 def test_shipped_rigs():
-    assert isinstance(load_rig("avis"), AvisTable) and load_rig("avis").geophones.sensitivity_Vs_per_m[0] == 31.25
+    assert isinstance(load_rig("avis"), IsolatorTable) and load_rig("avis").geophones.sensitivity_Vs_per_m[0] == 31.25
     assert load_rig("avis").acquisition.adc_bits == 14 and load_rig("avis").ambient.sensor_noise_rms_V == 1e-3
     bare, loaded = load_rig("halcyonics"), load_rig("halcyonics_loaded")
     assert isinstance(bare, Halcyonics) and bare.load is None and loaded.load.mass == 10.0

@@ -96,5 +96,5 @@ def test_comments_stand_behind_their_lines():
 def test_comments_that_cannot_be_written(comments):
     with pytest.raises(InputError, match="comments"):
         rig_toml(load_rig("avis"), comments)
-    with pytest.raises(InputError, match="expected an AvisTable"):
+    with pytest.raises(InputError, match="expected an IsolatorTable"):
         rig_toml(object())

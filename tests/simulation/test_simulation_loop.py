@@ -13,8 +13,8 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti import discretise, gain
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.converter import Converter
-from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.instability_cause import find_cause
 from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.sampled_loop import SampledLoop, SensorBank
 
@@ -170,7 +170,7 @@ def test_spectral_radius_is_the_growth_of_an_unstable_loop(make_loop, name, dela
     v = record.q_dot[-20:]
     (a, b), *_ = np.linalg.lstsq(np.column_stack([v[1:-1].ravel(), -v[:-2].ravel()]), v[2:].ravel(), rcond=None)
     assert spectral_radius(loop) == pytest.approx(np.sqrt(b), rel=1e-6) and np.sqrt(b) > 1.02
-    said = re.search(r"at (\S+) Hz,.* grows with a time constant of (\S+) s", find_culprit(loop).words())
+    said = re.search(r"at (\S+) Hz,.* grows with a time constant of (\S+) s", find_cause(loop).words())
     frequency_Hz = np.arccos(a / (2 * np.sqrt(b))) / (2 * np.pi) * loop.sample_rate_Hz
     assert float(said[1]) == pytest.approx(frequency_Hz, rel=0.01)
     assert float(said[2]) == pytest.approx(2 / np.log(b) / loop.sample_rate_Hz, rel=0.01)

@@ -17,7 +17,7 @@ from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.rigs.sensing import sensing
 from avis_ctrl.simulation.discrete import gain_at_rest
 from avis_ctrl.simulation.loop import flicker, simulate
-from avis_ctrl.study.at_rest import at_rest
+from avis_ctrl.study.dc_gain import at_rest
 from avis_ctrl.study.design_file import design_from_table, read_study, study_of
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop

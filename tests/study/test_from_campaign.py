@@ -12,14 +12,14 @@ import pytest
 from scipy.stats import chi2
 
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spread import kept_axes
+from avis_ctrl.identification.response_error import kept_axes
 from avis_ctrl.lti.norms import hinf_norm
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.simulation.discrete import spectral_radius
-from avis_ctrl.simulation.rehearsal import perturbed_truth
-from avis_ctrl.study.companions import design_companions
+from avis_ctrl.simulation.perturbed_campaign import perturbed_truth
 from avis_ctrl.study.design_file import read_study
+from avis_ctrl.study.other_axes import design_companions
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
 

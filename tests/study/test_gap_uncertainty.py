@@ -11,7 +11,7 @@ import pytest
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.response import ResponseModel
 from avis_ctrl.lti.connect import lft_upper
-from avis_ctrl.rigs.avis import AvisTable
+from avis_ctrl.rigs.isolator_table import IsolatorTable
 from avis_ctrl.rigs.logical_axes import actuator_axes
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.study.gap_design import PARAMETERS_PERCENT, without_ranges
@@ -21,7 +21,7 @@ from avis_ctrl.study.identification_design import default_design
 from avis_ctrl.uncertainty.uncertain_rig import UncertainEquation, uncertain_rig
 
 AVIS = load_rig("avis")
-assert isinstance(AVIS, AvisTable)
+assert isinstance(AVIS, IsolatorTable)
 RIG = AVIS.with_channels_apart()
 DESIGN = without_ranges(default_design(RIG, "z and phi_x", PARAMETERS_PERCENT))
 MECHANICS = (

@@ -12,9 +12,9 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.formats import read_measurements
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.equipment import Electronics
-from avis_ctrl.simulation.rehearsal import rehearse
+from avis_ctrl.simulation.perturbed_campaign import perturbed_campaign
 from avis_ctrl.study.gap import find_gap
-from avis_ctrl.study.hidden_effects import rehearse_with_effects
+from avis_ctrl.study.hidden_effects import campaign_with_effects
 from avis_ctrl.study.plan_file import plan_from_table, plan_toml, read_plan
 
 RIG = load_rig("avis")
@@ -30,7 +30,7 @@ QUIET = {
 def signals(*effects, **changed):
     return [
         one.y
-        for one in rehearse_with_effects(
+        for one in campaign_with_effects(
             RIG, plan_from_table(QUIET | {"effect": list(effects)} | changed), 4
         ).campaign.records
     ]
@@ -81,7 +81,7 @@ def test_a_plan_with_effects_is_written_as_it_is_read(tmp_path):
     path.write_text(plan_toml(plan), encoding="utf-8")
     assert read_plan(path) == plan
     with pytest.raises(InputError, match="change"):
-        rehearse(RIG, plan)
+        perturbed_campaign(RIG, plan)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_an_effect_is_named_behind_an_anti_alias_filter(effect, parameter, true)
         "truth": {"perturb_percent": 5.0, "perturb_damping_percent": 20.0},
         "record": [{"excitation": "noise", "level_V": level, "records": 2} for level in (0.08, 0.2, 0.4)],
     }
-    gap = find_gap(rehearse_with_effects(rig, plan_from_table(plan), 4).campaign, rig).gap
+    gap = find_gap(campaign_with_effects(rig, plan_from_table(plan), 4).campaign, rig).gap
     assert [one.name for one in gap.effects] == [effect["name"]] and gap.verdict == "explained"
     found = gap.effects[0].parameters[parameter]
     assert found.value == pytest.approx(true, abs=3 * found.std)

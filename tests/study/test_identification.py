@@ -1,4 +1,4 @@
-"""`avis identify` as a whole on a rehearsed campaign: truth found, files written, another campaign predicted."""
+"""`avis identify` as a whole on a simulated campaign: truth found, files written, another campaign predicted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.formats import read_measurements, write_campaign
 from avis_ctrl.measurement.frequency_response.local_polynomial import local_polynomial
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.simulation.rehearsal import rehearse
+from avis_ctrl.simulation.perturbed_campaign import perturbed_campaign
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.file_names import DESIGN_FILE, RIG_FILE
 from avis_ctrl.study.identification import Identification, IdentifyOptions, identify
@@ -32,20 +32,20 @@ FEW = IdentifyOptions(starts=1)
 
 
 @pytest.fixture(scope="module")
-def rehearsal():
+def simulated():
     rig = load_rig("avis")
-    return rehearse(rig, default_plan(rig, perturbed=True, duration_s=20.0), seed=3)
+    return perturbed_campaign(rig, default_plan(rig, perturbed=True, duration_s=20.0), seed=3)
 
 
 @pytest.fixture(scope="module")
-def found(rehearsal) -> Identification:
-    return identify(rehearsal.campaign, load_rig("avis"), FEW)
+def found(simulated) -> Identification:
+    return identify(simulated.campaign, load_rig("avis"), FEW)
 
 
-def test_the_truth_lies_within_the_standard_deviations(rehearsal, found):
+def test_the_truth_lies_within_the_standard_deviations(simulated, found):
     """Every determined direction, and each parameter that is known by itself."""
     information = found.campaign_fit.information
-    truth = np.array([rehearsal.truth.parameters()[name].value for name in information.names])
+    truth = np.array([simulated.truth.parameters()[name].value for name in information.names])
     sigma, V = information.directions
     z = (V.T @ ((information.values - truth) / information.scale) / sigma)[information.determined]
     assert information.rank == 20
@@ -92,7 +92,7 @@ def test_a_result_says_what_it_is_made_of(found):
     assert "%" in found.validation.verdict
 
 
-def test_files_and_predictions(rehearsal, found, tmp_path):
+def test_files_and_predictions(simulated, found, tmp_path):
     """The folder is read back, and predicts the records that it was made from down to their noise."""
     write_identification(found, tmp_path)
     result = json.loads((tmp_path / "result.json").read_text())
@@ -102,7 +102,7 @@ def test_files_and_predictions(rehearsal, found, tmp_path):
     assert known.amplifier_corner_Hz is None and known.turning == (0, 0)
     assert rig.parameters()["mass"].value == pytest.approx(found.rig.parameters()["mass"].value, rel=1e-14)
     assert "+-" in (tmp_path / "rig.toml").read_text()
-    one = rehearsal.campaign.only(("02",))
+    one = simulated.campaign.only(("02",))
     write_predictions(tmp_path, one, tmp_path / "pred.h5")
     record = one.records[0].load()
     with h5py.File(tmp_path / "pred.h5") as file:
@@ -112,10 +112,10 @@ def test_files_and_predictions(rehearsal, found, tmp_path):
     assert np.all(left < 0.02)
 
 
-def test_a_long_record_is_predicted_piece_by_piece_as_in_one(rehearsal, found, tmp_path, monkeypatch):
+def test_a_long_record_is_predicted_piece_by_piece_as_in_one(simulated, found, tmp_path, monkeypatch):
     """Against an independent march over all samples at once: each piece goes on where the last one stopped."""
     write_identification(found, tmp_path)
-    one = rehearsal.campaign.only(("02",))
+    one = simulated.campaign.only(("02",))
     write_predictions(tmp_path, one, tmp_path / "whole.h5")
     monkeypatch.setattr("avis_ctrl.study.identification_output.SETTINGS", PredictionSettings(piece=3001))
     write_predictions(tmp_path, one, tmp_path / "pieces.h5")
@@ -126,11 +126,11 @@ def test_a_long_record_is_predicted_piece_by_piece_as_in_one(rehearsal, found, t
 
 
 @pytest.mark.slow
-def test_frequency_responses_serve_as_well_as_records(rehearsal):
+def test_frequency_responses_serve_as_well_as_records(simulated):
     """The campaign reduced to frequency responses: a third of the lines is held out."""
     rig = load_rig("avis")
     plan = default_plan(rig, "orthogonal", perturbed=True, duration_s=20.0)
-    campaign = rehearse(rig, plan, seed=5).campaign
+    campaign = perturbed_campaign(rig, plan, seed=5).campaign
     driven = tuple(r.header.name for r in campaign.records if r.header.excitation == "multisine")[-8:]
     measured = local_polynomial(campaign.only(driven), band_Hz=(1.0, 40.0), floor=False)
     found = identify(measured, rig, FEW)
@@ -138,9 +138,9 @@ def test_frequency_responses_serve_as_well_as_records(rehearsal):
     assert found.findings == () and found.split is None
 
 
-def test_hold_out_and_parameters_as_asked(rehearsal):
+def test_hold_out_and_parameters_as_asked(simulated):
     options = IdentifyOptions(starts=1, hold_out=("03",), parameters=("mass", "J?"), band_Hz=(1.0, 20.0))
-    found = identify(rehearsal.campaign.only(("02", "03", "04")), rehearsal.truth, options)
+    found = identify(simulated.campaign.only(("02", "03", "04")), simulated.truth, options)
     assert [one.header.name for one in found.split.held_out.records] == ["03"]
     assert found.model.names == ("mass", "J1", "J2", "J3")
 
@@ -157,20 +157,20 @@ def test_hold_out_and_parameters_as_asked(rehearsal):
         ({"band_Hz": (200.0, 400.0)}, r"excited from [\d.]+ to \d+(\.\d)? Hz; expected a band that overlaps"),
     ],
 )
-def test_options_that_do_not_fit_are_answered(rehearsal, change, said):
+def test_options_that_do_not_fit_are_answered(simulated, change, said):
     with pytest.raises(InputError, match=said) as error:
-        identify(rehearsal.campaign, load_rig("avis"), IdentifyOptions(**({"starts": 1} | change)))
+        identify(simulated.campaign, load_rig("avis"), IdentifyOptions(**({"starts": 1} | change)))
     assert "\n" not in str(error.value)
 
 
-def test_another_rig_is_refused_by_name(rehearsal):
+def test_another_rig_is_refused_by_name(simulated):
     with pytest.raises(InputError, match="sensors of the rig halcyonics"):
-        identify(rehearsal.campaign, load_rig("halcyonics"), FEW)
+        identify(simulated.campaign, load_rig("halcyonics"), FEW)
 
 
-def test_a_gate_that_says_stop_stops(rehearsal):
+def test_a_gate_that_says_stop_stops(simulated):
     """A dead channel; and going on all the same is possible only as far as the data allow."""
-    record = rehearsal.campaign.named("02").load()
+    record = simulated.campaign.named("02").load()
     y = record.y.copy()
     y[:, 1] = 0.5
     broken = Campaign("avis", (type(record)(record.header, record.u, y, record.floor),))
@@ -179,8 +179,8 @@ def test_a_gate_that_says_stop_stops(rehearsal):
 
 
 @pytest.mark.slow
-def test_a_campaign_through_a_file_gives_the_same(rehearsal, found, tmp_path):
-    write_campaign(tmp_path / "c.h5", rehearsal.campaign)
+def test_a_campaign_through_a_file_gives_the_same(simulated, found, tmp_path):
+    write_campaign(tmp_path / "c.h5", simulated.campaign)
     again = identify(read_measurements(tmp_path / "c.h5"), load_rig("avis"), FEW)
     assert np.array_equal(again.campaign_fit.fit.values, found.campaign_fit.fit.values)
     assert again.provenance["measurement_sha256"] == found.provenance["measurement_sha256"]

@@ -21,12 +21,12 @@ from avis_ctrl.robust.hinfsyn import hinfsyn
 from avis_ctrl.robust.mu import mu
 from avis_ctrl.robust.mu_gain import perturbed
 from avis_ctrl.robust.mu_peak import mu_peak
-from avis_ctrl.study import limits
+from avis_ctrl.study import limiting_bounds
 from avis_ctrl.study.analysis import analyse, bound, worst_of_axis
 from avis_ctrl.study.controllers import passive, peak_of_loop, reduction_grid
 from avis_ctrl.study.design_file import Design, RequirementSection, design_from_table, read_study, study_of
 from avis_ctrl.study.design_result import ControllerResult
-from avis_ctrl.study.limits import best_found, limiting
+from avis_ctrl.study.limiting_bounds import best_found, limiting
 from avis_ctrl.study.plant import DesignPlant, build_plant
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.runner import skyhook_limit
@@ -277,7 +277,7 @@ def test_the_peak_named_is_that_of_the_upper_bound(one_axis, measured):
 def test_what_is_said_of_mu_above_one_was_computed(one_axis, measured, monkeypatch, lower, upper, curve, said):
     """No sentence on single bounds if mu is below 1 at all computed frequencies."""
     _, plant = one_axis
-    monkeypatch.setattr(limits, "_not_even_nominal", lambda plant: "")
+    monkeypatch.setattr(limiting_bounds, "_not_even_nominal", lambda plant: "")
     skyhook = measured["skyhook_classical"]
     scaled = skyhook.mu.upper_curve * (curve / np.max(skyhook.mu.upper_curve))
     mu = replace(skyhook, mu=replace(skyhook.mu, lower=lower, upper=upper, upper_curve=scaled))
@@ -290,7 +290,7 @@ def test_figures_of_the_advice_are_rounded_in_the_safe_direction(one_axis, measu
     """Relaxed or reduced as the sentences say, mu of the loop is below 1 at the computed frequencies."""
     _, plant = one_axis
     skyhook, P = measured["skyhook_classical"], plant.synthesis
-    text = limits._relief(plant, skyhook)
+    text = limiting_bounds._relief(plant, skyhook)
     M = P.closed(skyhook.K).frequency_response(skyhook.mu.frequencies)
     n_z, is_e = P.blocks.n_z, np.array([name.startswith("e_") for name in P.z])
     divisor, every = (
@@ -309,7 +309,7 @@ def test_figures_of_the_advice_are_rounded_in_the_safe_direction(one_axis, measu
 )
 def test_the_keys_of_a_bound_are_those_at_the_frequency(one_axis, hertz, part):
     """-7 dB from 1 to 10 Hz, with a transition of 0.8 octaves."""
-    assert limits._part(one_axis[1], "transmissibility bound", 2 * np.pi * hertz) == f" {part}"
+    assert limiting_bounds._part(one_axis[1], "transmissibility bound", 2 * np.pi * hertz) == f" {part}"
 
 
 @pytest.mark.slow

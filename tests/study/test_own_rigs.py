@@ -8,7 +8,7 @@ import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import COORDINATES, load_rig
-from avis_ctrl.rigs.actuator import pade_delay
+from avis_ctrl.rigs.delay_models import pade_delay
 from avis_ctrl.rigs.logical_axes import actuator_axes, sensor_axes
 from avis_ctrl.rigs.sensing import conditioning
 from avis_ctrl.study.design_file import design_from_table

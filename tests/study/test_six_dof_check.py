@@ -10,8 +10,8 @@ import pytest
 
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.analysis import SETTINGS
-from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_file import read_study
+from avis_ctrl.study.other_axes import Companions
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import six_dof_check
 

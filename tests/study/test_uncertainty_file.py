@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.information import Information
-from avis_ctrl.identification.spread import SETTINGS, FrfSpread
+from avis_ctrl.identification.response_error import SETTINGS, FrfSpread
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.rigs.rig_writer import rig_toml
 from avis_ctrl.simulation.discrete import linear_part

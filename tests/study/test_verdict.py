@@ -10,12 +10,12 @@ import pytest
 
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.robust.musyn_iteration import STOPPED
-from avis_ctrl.simulation.culprit import Culprit
 from avis_ctrl.simulation.design_check import PlantCheck
+from avis_ctrl.simulation.instability_cause import InstabilityCause
 from avis_ctrl.study.design_result import DesignResult, Requirement, Simulated
 from avis_ctrl.study.verdict import all_axes, check_loop, first_sentence, refuse_unstable, requirement_rows
 
-CULPRIT = Culprit("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
+CULPRIT = InstabilityCause("nominal", 1.00016, 0.99, 0.16, ("x", "phi_y"), "companions", ("x", "y"))
 
 
 def plant(name: str, radius: float, diverged: bool = False, clipped: int = 0) -> PlantCheck:
@@ -124,7 +124,9 @@ def test_the_advice_fits_the_cause(stability, moving, advice):
     mu = SimpleNamespace(
         name="mu", notes=(), stability=SimpleNamespace(upper=stability), mu=SimpleNamespace(upper=3.59)
     )
-    found = result([plant("worst case", 1.00003)], Culprit("worst case", 1.00003, 18.2, 0.03, moving, "controller"))
+    found = result(
+        [plant("worst case", 1.00003)], InstabilityCause("worst case", 1.00003, 18.2, 0.03, moving, "controller")
+    )
     found = replace(found, controllers=(mu,), design=SimpleNamespace(keep=["z", "phi_x"]))
     with pytest.raises(ComputationError) as refused:
         refuse_unstable(found)

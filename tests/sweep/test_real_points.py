@@ -14,7 +14,7 @@ from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.measurement.formats import write_campaign
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak, worst_case_gain
-from avis_ctrl.simulation.rehearsal import rehearse
+from avis_ctrl.simulation.perturbed_campaign import perturbed_campaign
 from avis_ctrl.study.design_file import read_study
 from avis_ctrl.study.plan_file import read_plan
 from avis_ctrl.study.plant import build_plant
@@ -92,7 +92,7 @@ def test_the_gap_of_a_simulated_lag(tmp_path):
     """Named where the sweep's point does not know of it, and not where it does."""
     table = load_rig("avis")
     (tmp_path / "plan.toml").write_text(PLAN)
-    write_campaign(tmp_path / "campaign.h5", rehearse(table, read_plan(tmp_path / "plan.toml"), 1).campaign)
+    write_campaign(tmp_path / "campaign.h5", perturbed_campaign(table, read_plan(tmp_path / "plan.toml"), 1).campaign)
     (tmp_path / "points.toml").write_text(f"""
 kind = "gap"
 base = "campaign.h5"

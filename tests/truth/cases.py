@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
-from avis_ctrl.rigs import AvisTable, load_rig
+from avis_ctrl.rigs import IsolatorTable, load_rig
 
 from .clutter import Pilot, add_trace, disturb, draw_traces, far, tolerances
 from .effect import STRENGTHS, Draw, Effect, Hidden
@@ -73,7 +73,7 @@ class Case:
 
 
 @cache
-def rig() -> AvisTable:
+def rig() -> IsolatorTable:
     """The rig file (AVIS_RIG, or the shared one)."""
     shared = Path(__file__).resolve().parents[3] / "shared" / "rigs" / "avis.toml"
     return load_rig(Path(os.environ.get("AVIS_RIG", shared)))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.rigs import AvisTable
+from avis_ctrl.rigs import IsolatorTable
 
 from .effect import Draw, Effect, Hidden
 from .library_mechanics import about_one
@@ -36,7 +36,7 @@ UNEXPLAINED = 0.003, 0.01  # by all traces together
 PILOT_S = 16.0  # at each level
 
 
-def tolerances(rig: AvisTable) -> dict[str, float]:
+def tolerances(rig: IsolatorTable) -> dict[str, float]:
     """Of the rig file, or the defaults; per cent as parts of one under the same names."""
     own = {name: float(getattr(rig.tolerances, name, default)) for name, default in DEFAULTS.items()}
     return {name: value / 100 if name.endswith("percent") else value for name, value in own.items()}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from avis_ctrl.rigs import AvisTable
+from avis_ctrl.rigs import IsolatorTable
 
 from .kernel import Physics
 
@@ -31,7 +31,7 @@ class Plant:
     motor_d (earth axes) and sensor_n (body axes) are the rig's until a clutter moves them.
     """
 
-    rig: AvisTable
+    rig: IsolatorTable
     m: float
     J: np.ndarray
     k: np.ndarray
@@ -169,7 +169,7 @@ class Plant:
         return Physics(**values)
 
 
-def draw_plant(rig: AvisTable, rng: np.random.Generator, spread: float = 1.0) -> Plant:
+def draw_plant(rig: IsolatorTable, rng: np.random.Generator, spread: float = 1.0) -> Plant:
     """A table whose mass, moments of inertia and stiffnesses lie within +-5 % of the rig's, dampings within +-20 %.
 
     spread : 0 gives the rig's own numbers.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avis_ctrl.rigs import AvisTable
+from avis_ctrl.rigs import IsolatorTable
 
 from . import cases, clutter
 from .cases import best_prediction, build_plant, draw_case, rig, run, simulate_case, tolerances
@@ -117,7 +117,7 @@ def test_matrices_of_a_cluttered_table_are_those_of_the_package():
         for one, p, d, tau in zip(table.all_drives, plant.motor_p, plant.motor_d, plant.motor, strict=True)
     )
     J = plant.J
-    same: AvisTable = replace(
+    same: IsolatorTable = replace(
         table,
         mass=plant.m,
         inertia=(*np.diag(J), J[0, 1], J[0, 2], J[1, 2]),

@@ -21,7 +21,7 @@ from scipy import signal
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.gap.axis.analysis import analyse
-from avis_ctrl.gap.axis.levels import levels, read_levels
+from avis_ctrl.gap.axis.level_dependence import levels, read_levels
 from avis_ctrl.gap.axis.mass import drive, oscillator, position_of
 from avis_ctrl.gap.axis.model import Effect, Problem
 from avis_ctrl.gap.axis.records import Signals

@@ -232,7 +232,7 @@ def sensor_effects(f: np.ndarray, channels: Sequence[str]) -> list[Effect]:
             Effect(
                 "crosstalk",
                 "displacement",
-                "a share of the velocity in the displacement channel",
+                "a fraction of the velocity in the displacement channel",
                 (Parameter("share_s", "s", -longest, longest),),
                 "the magnitude at higher frequencies",
                 channel=lambda s, p: 1 + s * p[0],

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from avis_ctrl.gap.effects import attached, cable, chassis, drives, flexible_mode, mounts, payload, sensors
+from avis_ctrl.gap.effects import attached_oscillator, cable, chassis, drives, flexible_mode, mounts, payload, sensors
 from avis_ctrl.gap.effects.base import Effect, registered
 
 # Importing one of these files registers its effects.
-FILES = (attached, cable, chassis, drives, flexible_mode, mounts, payload, sensors)
+FILES = (attached_oscillator, cable, chassis, drives, flexible_mode, mounts, payload, sensors)
 
 
 def library() -> dict[str, Effect]:

@@ -28,7 +28,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.converter import nominal_converter
 from avis_ctrl.gap.signals.hum import HumFinding, polluted
-from avis_ctrl.gap.signals.quiet_lines import QuietLines, quiet_lines
+from avis_ctrl.gap.signals.noise_lines import QuietLines, quiet_lines
 from avis_ctrl.gap.signals.record_residual import HANN_SHARED, RecordResidual
 from avis_ctrl.rigs.rig import Rig
 

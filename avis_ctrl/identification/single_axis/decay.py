@@ -64,9 +64,9 @@ def fit_decay(
     if np.linalg.norm(e) > 0.5 * np.linalg.norm(y):
         raise ComputationError(
             "no decaying oscillation fits the record",
-            measured=f"{100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of it is left",
+            measured=f"the residual is {100 * np.linalg.norm(e) / np.linalg.norm(y):.0f} % of the signal",
             cause="a start before the release, or a second event inside",
-            next_step="choose the stretch after one release",
+            next_step="choose the part after one release",
         )
     return concluded(
         "free decay of a second-order oscillator",
@@ -76,7 +76,10 @@ def fit_decay(
         found.jac.reshape(*e.shape, 2) / start,
         2 + (3 + drift) * y.shape[1],
         (time, y, y - e),
-        notes=("at the amplitudes of this stretch; what moves with the amplitude, the deviations do not hold",),
+        notes=(
+            "valid at the amplitudes of this part of the record; the standard deviations do not include changes with "
+            "amplitude",
+        ),
     )
 
 

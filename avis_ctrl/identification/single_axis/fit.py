@@ -107,9 +107,8 @@ class SingleAxisFit(Shown):
             )
         ]
         found.append(
-            f"rank {self.information.rank} of {len(self.names)}; residual "
-            f"{100 * self.residual.share:.2f} % of the measured; chi2/dof {self.chi2_per_dof:.3g} against "
-            f"{self.noise} noise"
+            f"rank {self.information.rank} of {len(self.names)}; residual {100 * self.residual.share:.2f} % of the "
+            f"measured signal; chi-square per degree of freedom {self.chi2_per_dof:.3g}, relative to {self.noise} noise"
         )
         return [*found, f"standard deviations: {self.covariance_method}", *self.notes]
 
@@ -266,7 +265,7 @@ def regression(
         raise InputError("expected finite numbers", field="samples")
     if lost := [name for name, x, z in zip(parameters, X.T, Z.T, strict=True) if not (np.any(x) and np.any(z))]:
         raise ComputationError(
-            f"the data hold nothing of {lost[0]}",
+            f"the data contain no information on {lost[0]}",
             measured="its column is zero throughout",
             cause="an axis that never moved, or a channel that was mapped wrongly",
             next_step="look at the columns, or leave the parameter out",

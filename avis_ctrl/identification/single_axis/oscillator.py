@@ -99,8 +99,8 @@ def fit_oscillator(u: np.ndarray, y: np.ndarray, sample_rate_Hz: float, band_Hz:
         lags=SETTINGS.correlated_lines,
         method=f"noise from the residual's spectrum, neighbouring {SETTINGS.correlated_lines} lines correlated",
         notes=(
-            "of the best linear oscillator at the level of this record; another level has another, "
-            "which the deviations do not hold",
+            "values of the best linear oscillator at the level of this record; they change with the level, which the "
+            "standard deviations do not include",
             "figure data: spectrum of the output and of the model's, transient included",
         ),
     )

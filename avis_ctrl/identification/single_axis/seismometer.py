@@ -148,8 +148,8 @@ def fit_seismometer(data: Responses, delay: bool = True) -> SingleAxisFit:
         (data.frequency_Hz, measured, predicted),
         lags=SETTINGS.correlated_lines,
         relative=(measured - predicted) / np.abs(measured),
-        method=f"misfit of {100 * r:.2g} % a frequency added to the noise, neighbouring frequencies correlated "
-        f"(Newey-West, {min(SETTINGS.correlated_lines, len(e) // 4)} lags)",
+        method=f"a model error of {100 * r:.2g} % at each frequency is added to the noise; neighbouring frequencies "
+        f"are correlated (Newey-West, {min(SETTINGS.correlated_lines, len(e) // 4)} lags)",
         given_chi2=float(np.sum(misses(theta, 0.0) ** 2)),
         notes=(f"columns of the figure data: {', '.join(kinds)}",),
     )

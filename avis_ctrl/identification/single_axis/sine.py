@@ -67,7 +67,10 @@ class SineRecord:
             if self.held[i] > 0.04
             else ""
         )
-        return f"record {self.name}, {channel}: a sine leaves {100 * self.unexplained[i]:.0f} % unexplained{stuck}"
+        return (
+            f"record {self.name}, {channel}: the residual of a sine is {100 * self.unexplained[i]:.0f} % of the "
+            f"signal{stuck}"
+        )
 
     def _index(self, channel: str) -> int:
         if channel not in self.channels:

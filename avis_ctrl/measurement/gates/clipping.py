@@ -100,16 +100,19 @@ class Clipping(Gate):
             self._finding([row for row in bad if row.channel == channel])
             for channel in dict.fromkeys(row.channel for row in bad)
         ]
-        peaks = {
-            n: max(r.peak for r in rows if r.channel == n) for n in (*self.campaign.u_names, *self.campaign.y_names)
-        }
-        top = max(peaks, key=lambda n: peaks[n])
+        u_names, y_names = self.campaign.u_names, self.campaign.y_names
+        peaks = {n: max(r.peak for r in rows if r.channel == n) for n in (*u_names, *y_names)}
+        u_unit, y_unit = self.campaign.records[0].header.u_unit, self.campaign.y_unit
+        u_top, y_top = max(u_names, key=lambda n: peaks[n]), max(y_names, key=lambda n: peaks[n])
         end = None if self.expectation.y_range_V is None else self.expectation.y_range_V[1]
         limits = () if end is None else (Limit("converter", end),)
-        label = f"largest value [{self.campaign.y_unit}]"
-        picture = bars("Largest absolute value of each channel", "channel", label, peaks, limits)
-        sentence = f"No channel is clipped; the largest value is {peaks[top]:.4g} at {top!r}."
-        return found or [Finding(self.name, "ok", sentence, value=peaks[top], limit=end, picture=picture)]
+        unit = y_unit if u_unit == y_unit else f"drives: {u_unit}, sensors: {y_unit}"
+        picture = bars("Largest absolute value of each channel", "channel", f"largest value [{unit}]", peaks, limits)
+        sentence = (
+            f"No channel is clipped; the largest values are {peaks[u_top]:.4g} {u_unit} at drive {u_top!r} and "
+            f"{peaks[y_top]:.4g} {y_unit} at sensor {y_top!r}."
+        )
+        return found or [Finding(self.name, "ok", sentence, value=peaks[y_top], limit=end, picture=picture)]
 
     def _unit(self, rows: list[_Ends], names: tuple[str, ...]) -> Finding:
         """Finding for records with most samples at or beyond the range."""

@@ -8,10 +8,10 @@ import numpy as np
 
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Bullets, Document, Paragraph, Section, listed, section, table
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.gap.opening import named
+from avis_ctrl.report.gap.summary import named
 from avis_ctrl.report.identification.gates import figure_of
-from avis_ctrl.report.pieces import Bullets, Document, Paragraph, Section, listed, section, table
 from avis_ctrl.report.provenance import document_of
 
 
@@ -44,7 +44,7 @@ def _summary(gap: AxisGap) -> Section:
         ),
         figure_of("ladder", "The gap before and after each effect.", gap.pictures[:1], height=0.7),
         named(gap, ""),
-        Paragraph(f"What would distinguish them: {words.sentence(further)}") if further else None,
+        Paragraph(f"What to measure next: {words.sentence(further)}") if further else None,
         Bullets(list(map(words.sentence, rest))),
         alone=True,
     )
@@ -57,11 +57,11 @@ def _model(gap: AxisGap) -> Section:
         [(name, wording.quantity(p)) for name, p in {**gap.parameters, **gap.ratios}.items()],
     )
     others = listed(
-        "What else was fitted in the place of an effect.",
+        "Alternatives to the named effects.",
         gap.runners_up,
         {
             "effect": lambda one: wording.titled(one.name),
-            "in the place of": lambda one: wording.titled(one.instead_of),
+            "alternative to": lambda one: wording.titled(one.instead_of),
             "probability": lambda one: wording.probability(one.probability),
         },
         "llr",

@@ -8,6 +8,7 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Piece, Section, Table, section, table
 from avis_ctrl.report.figures import (
     STYLES,
     Axis,
@@ -23,7 +24,6 @@ from avis_ctrl.report.figures import (
     steps,
 )
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, section, table
 from avis_ctrl.report.response_panels import difference, drives, magnitude
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
@@ -138,8 +138,8 @@ def responses(seen: GapOverlay, named: bool, hum: bool = False) -> list[Piece]:
     if seen.left_out:
         names = joined(list(map(wording.titled, seen.left_out)))
         text += (
-            f" The drawn response of the updated model is without {names}: what depends on amplitude or time has "
-            "no frequency response."
+            f" The response of the updated model is drawn without {names}, because effects that depend on amplitude "
+            "or time have no frequency response."
         )
     points = (
         f"the {who} model's response plus its residual, regressed on the inputs (points)"

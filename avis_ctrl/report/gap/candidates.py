@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from avis_ctrl.gap.result import Considered
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Fold, Paragraph, Section, Table, listed, section, shown
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Fold, Paragraph, Section, Table, listed, section, shown
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 
@@ -17,8 +17,8 @@ def candidates(found: GapFinding) -> Section:
         "Candidates that were fitted together with all parameters of the rig, and the reason for rejection. "
         "Chi-square is that of selected lines of the held-out records, dense at the resonances, and differs from "
         "that of all lines. Steps are numbered in the order in which effects were added. Form: law of the effect, or "
-        "its number of modes. Probability: from the less certain of two odds (section on the method); it need not "
-        "follow the log evidence."
+        "its number of modes. The probability uses the smaller of two odds (section on the method), so its order may "
+        "differ from that of the log evidence."
     )
     others = ranked[SETTINGS.candidates :]
     return section(

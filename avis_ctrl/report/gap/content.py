@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from avis_ctrl.report.elements import Document, Section, section
 from avis_ctrl.report.gap.before_after import before_after
 from avis_ctrl.report.gap.candidates import candidates
 from avis_ctrl.report.gap.controller import controller
-from avis_ctrl.report.gap.dependence import dependence
 from avis_ctrl.report.gap.effects import parameters
-from avis_ctrl.report.gap.opening import opening
+from avis_ctrl.report.gap.level_and_time import dependence
 from avis_ctrl.report.gap.places import places
 from avis_ctrl.report.gap.remaining import remaining
+from avis_ctrl.report.gap.summary import opening
 from avis_ctrl.report.identification.gates import gates
 from avis_ctrl.report.method import method
-from avis_ctrl.report.pieces import Document, Section, section
 from avis_ctrl.report.provenance import document_of
 from avis_ctrl.report.records import records, remarks
 from avis_ctrl.study.gap import GapFinding

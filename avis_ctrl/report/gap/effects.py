@@ -10,8 +10,8 @@ from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.result import Gap, NamedEffect
 from avis_ctrl.gap.table_model import inseparable_parameters
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Bullets, Fold, Paragraph, Section, Table, section, shown, table
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Bullets, Fold, Paragraph, Section, Table, section, shown, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.summary import joined
@@ -114,10 +114,10 @@ def _always(gap: Gap) -> Paragraph | None:
             both = words.with_std(value, sigma[name]) if name in sigma else (words.number(value),)
             told.append(f"{wording.titled(name.rpartition('.')[2])} {' ± '.join(both)}")
     text = (
-        "Every model, with or without a named effect, also contains the second-order terms of large rotations, which "
-        "exist in every table. Their factors are fitted, too, and are often poorly determined: that of the mounts "
-        "(in theory 1), and the fractions of the payload's rotation that the axes of drives and of sensors follow (1 "
-        f"if they are fixed to the payload, 0 if to the chassis): {'; '.join(told)}."
+        "Every model also contains the second-order terms of large rotations, which exist in every table. Their "
+        "factors are fitted and often poorly determined. The factor of the mounts is 1 in theory. The factors of the "
+        "drives' and the sensors' axes are 1 if these are fixed to the payload, and 0 if they are fixed to the "
+        f"chassis: {'; '.join(told)}."
     )
     return Paragraph(text, "note") if told else None
 

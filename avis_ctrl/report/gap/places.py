@@ -8,9 +8,9 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, HeatMap, Where
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Section, Table, listed, section
 from avis_ctrl.report.figures import Axis, Figure, Heat, Panel, hertz
 from avis_ctrl.report.gap import wording
-from avis_ctrl.report.pieces import Paragraph, Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 
@@ -22,7 +22,9 @@ def places(found: GapFinding) -> Section:
         "Where they disagree",
         "where",
         heat_map(gap.heat, bool(gap.effects)) if gap.heat is not None else None,
-        table_of(gap.where, "Places of the gap after re-identification, before any effect is added. "),
+        table_of(
+            gap.where, "Bands and channels with the largest error after re-identification, before any effect is added. "
+        ),
         None if gap.where else Paragraph(_nowhere(gap)),
     )
 

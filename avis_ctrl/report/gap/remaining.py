@@ -6,9 +6,9 @@ import numpy as np
 
 from avis_ctrl.gap.result import Detectable, Gap, spoken
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Section, Table, headed, section, table
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.places import table_of
-from avis_ctrl.report.pieces import Paragraph, Section, Table, headed, section, table
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.summary import joined
 

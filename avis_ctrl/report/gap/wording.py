@@ -11,7 +11,7 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.result import Considered, Gap, NamedEffect, Where, spoken
 from avis_ctrl.gap.settings import SETTINGS as GAP
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Paragraph
+from avis_ctrl.report.elements import Paragraph
 from avis_ctrl.summary import joined
 from avis_ctrl.uncertain_value import with_prefix
 
@@ -19,7 +19,7 @@ from avis_ctrl.uncertain_value import with_prefix
 CLAIMS = {
     "none": "Verdict: none. The parameters of the rig were re-identified, and the other values of the rig file were "
     "fitted with their tolerances as standard deviations. The residual is noise, or less than 1 % of the "
-    "response, and no effect is named except traces. An effect "
+    "response. Apart from traces, no effect is named. An effect "
     "can still be present if it is too weak for this campaign, if these records do not excite it, or if "
     "the parameters of the rig can imitate it.",
     "explained": "Verdict: explained. Refitted values and the effects named above remove {removed} of the power that "

@@ -7,8 +7,8 @@ import numpy as np
 from avis_ctrl.identification.ekf_result import EkfResult, Innovations, kinds
 from avis_ctrl.identification.identifiability_text import main_members
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Bullets, Paragraph, Section, Table, headed, listed, section, table, yes_or_no
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, level
-from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, headed, listed, section, table, yes_or_no
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.summary import joined

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from avis_ctrl.report.elements import Document
 from avis_ctrl.report.identification.comparison import ways
 from avis_ctrl.report.identification.gates import gates
 from avis_ctrl.report.identification.identifiability import identifiability
 from avis_ctrl.report.identification.measurements import measurements
-from avis_ctrl.report.identification.opening import opening, parameters
 from avis_ctrl.report.identification.responses import responses
+from avis_ctrl.report.identification.summary import opening, parameters
 from avis_ctrl.report.identification.validation import validation
 from avis_ctrl.report.method import method
-from avis_ctrl.report.pieces import Document
 from avis_ctrl.report.provenance import document_of
 from avis_ctrl.report.sections.identified import uncertainty
 from avis_ctrl.study.identification import Identification

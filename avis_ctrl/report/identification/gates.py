@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 
 from avis_ctrl.measurement.gates.finding import SEVERITIES, Finding, Limit, Picture, Series
+from avis_ctrl.report.elements import Cell, Fold, Mark, Paragraph, Piece, Section, section, shown, table
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Scale, Style, numbered, values_of
-from avis_ctrl.report.pieces import Cell, Fold, Mark, Paragraph, Piece, Section, section, shown, table
 from avis_ctrl.report.settings import SETTINGS
 
 MARKS: dict[str, Cell] = {
@@ -38,8 +38,9 @@ def gates(findings: Sequence[Finding]) -> Section:
     pieces: list[Piece] = [
         table(
             f"The gates: automatic checks of the data before any fit, the most serious findings first ({counts}). A "
-            "note is for information, a warning means less accurate results, a stop means wrong results. A gate is not "
-            "tested if no record can show what it looks for.",
+            "note is for information, a warning means less accurate results, a stop means wrong results. A gate is "
+            '"not '
+            'tested" if no record could show the fault.',
             ("gate", "severity", "finding"),
             rows,
             "lcl",

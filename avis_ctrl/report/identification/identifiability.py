@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Bullets, Paragraph, Section, Table, headed, section, table
 from avis_ctrl.report.figures import Axis, Figure, Panel, Style, level, log_limits, markers
-from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, headed, section, table
 from avis_ctrl.study.identification import Identification
 
 

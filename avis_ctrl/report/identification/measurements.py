@@ -11,7 +11,7 @@ from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.distortion_lines import DistortionLevels, Kind, distortion_levels
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, section, table
+from avis_ctrl.report.elements import Paragraph, Piece, Section, Table, section, table
 from avis_ctrl.report.records import records, remarks
 from avis_ctrl.study.identification import Identification
 

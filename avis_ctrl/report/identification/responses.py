@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from avis_ctrl.identification.overlays import ResponseOverlay
+from avis_ctrl.identification.measured_responses import ResponseOverlay
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Section, section
 from avis_ctrl.report.figures import Axis, Band, Curve, Figure, Panel, Style, hertz, log_limits, markers
-from avis_ctrl.report.pieces import Paragraph, Section, section
 from avis_ctrl.report.response_panels import MEASURED, SCATTER, Model, difference, drives, magnitude, thin, title, unit
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.identification import Identification

@@ -7,8 +7,19 @@ import numpy as np
 from avis_ctrl.identification.validation import HeldOut
 from avis_ctrl.identification.whiteness import Correlation
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import (
+    Bullets,
+    Paragraph,
+    Piece,
+    Section,
+    Table,
+    listed,
+    section,
+    shown,
+    table,
+    yes_or_no,
+)
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, bars, log_limits, markers, numbered, places
-from avis_ctrl.report.pieces import Bullets, Paragraph, Piece, Section, Table, listed, section, shown, table, yes_or_no
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.identification import Identification
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, controller_style, hertz, level
-from avis_ctrl.report.pieces import Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import Bound, ControllerResult, DesignResult
 from avis_ctrl.summary import digits_apart
@@ -122,9 +122,9 @@ def _worst(result: DesignResult) -> Table:
         )
     ]
     return table(
-        "The worst perturbations found, in physical terms. Each reaches the lower bound stated beside it. The "
-        "perturbations of mu have the size 1/mu: if mu is below 1, they are larger than the declared uncertainty. "
-        "Those of the transmissibility are within it.",
+        "The worst perturbations found, in physical terms. Each attains the lower bound beside it. Perturbations for "
+        "mu have the size 1/mu: if mu is below 1, they exceed the declared uncertainty. Perturbations for the "
+        "transmissibility are within it.",
         ("worst case of", "reaches", "at", "perturbation"),
         [(what, value, words.hertz(b.omega), "; ".join(b.words) or "none was found") for what, b, value in cases],
         "lrrl",

@@ -9,8 +9,8 @@ import numpy as np
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.lti.statespace import StateSpace
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Section, Table, listed, section
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, controller_style, hertz, numbered
-from avis_ctrl.report.pieces import Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
 
@@ -44,8 +44,8 @@ def _files(result: DesignResult, made: list[ControllerResult]) -> Table:
             "fastest pole": lambda c: f"{words.number(c.fastest_pole_Hz)} Hz",
             "relative to half the rate": lambda c: words.number(2 * c.fastest_pole_Hz / rate),
             "stable by itself": lambda c: words.yes(_system(c).is_stable()),
-            "gain at rest": lambda c: f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
-            "range used by offset": lambda c: _offset(c.rest.percent) if c.rest else "",
+            "gain at zero frequency": lambda c: f"{words.number(c.rest.gain_Ns_per_m)} N s/m" if c.rest else "",
+            "fraction of the range for offsets": lambda c: _offset(c.rest.percent) if c.rest else "",
         },
         "llrrrcrr",
     )

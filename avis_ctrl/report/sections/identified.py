@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Piece, Section, Table, headed, section, table
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, markers
-from avis_ctrl.report.pieces import Paragraph, Piece, Section, Table, headed, section, table
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.study.identification import Identification
@@ -33,12 +33,13 @@ def _origin(content: UncertaintyFile, found: InDesign) -> Paragraph:
     determined, kept = len(content.direction), len(found.directions)
     text = (
         f"The identification{f' ({source})' if source else ''} determined {determined} combinations of "
-        f"{len(content.parameter)} parameters; {content.undetermined} have no influence on the measurements and "
-        f"keep their starting values. "
+        f"{len(content.parameter)} parameters; {content.undetermined} other combinations have no influence on the "
+        "measurements and keep their starting values. "
     )
     if kept:
         text += (
-            f"{kept} of them are bounded directions of the uncertainty set, each with a range of ± "
+            f"{kept} of the determined combinations are bounded directions of the uncertainty set, each with a range "
+            "of ± "
             f"{words.number(d.box)} standard deviations. The remaining combinations together change the response "
             f"by at most {_percent(d.rest)} and the transmissibility by at most {_percent(d.rest_floor)}. "
         )
@@ -49,10 +50,11 @@ def _origin(content: UncertaintyFile, found: InDesign) -> Paragraph:
             "no separate uncertainty block. "
         )
     text += (
-        "The remaining combinations are added to the spread of the response. As the spread acts at the actuators, "
-        "their influence on the response to floor motion is not covered. If the errors are normally distributed, "
+        "The remaining combinations are added to the bound on the error of the response. This bound acts at the "
+        "actuators, so it does not cover their influence on the response to floor motion. If the errors are normally "
+        "distributed, "
         "directions and remaining combinations contain the true parameters with a probability of "
-        f"{words.number(100 * d.coverage)} %, and the spread bounds the error of the response with a probability "
+        f"{words.number(100 * d.coverage)} %, and the error of the response is within its bound with a probability "
         f"of {words.number(100 * found.confidence)} % at each frequency."
     )
     return Paragraph(text)

@@ -7,9 +7,9 @@ import numpy as np
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
 from avis_ctrl.report.block_diagram import block_diagram
+from avis_ctrl.report.elements import Bullets, Drawing, Paragraph, Section, Table, headed, section, table
 from avis_ctrl.report.families import EXTERNAL, Families
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, hertz, level, numbered
-from avis_ctrl.report.pieces import Bullets, Drawing, Paragraph, Section, Table, headed, section, table
 from avis_ctrl.report.sections.identified import identified
 from avis_ctrl.report.sections.transmissibility import nominal, target, upper_bound
 from avis_ctrl.report.settings import SETTINGS
@@ -165,8 +165,8 @@ def _chains(plant: DesignPlant) -> Figure | None:
     curves.append(level(*SETTINGS.weight_Hz, 100.0, "100 %"))
     return Figure(
         "weight_chains",
-        "Neglected dynamics of each channel: relative uncertainty over frequency. Where it exceeds 100 %, not even the "
-        "sign of the channel is known.",
+        "Neglected dynamics of each channel: relative uncertainty over frequency. Where it exceeds 100 %, neither gain "
+        "nor phase of the channel is known.",
         [Panel(hertz(), Axis("uncertainty [%]", "log", (1.0, 1000.0)), curves)],
     )
 

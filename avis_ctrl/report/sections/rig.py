@@ -9,12 +9,12 @@ import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Drawing, Heading, Paragraph, Piece, Section, Table, listed, section, table
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, numbered
-from avis_ctrl.report.pieces import Drawing, Heading, Paragraph, Piece, Section, Table, listed, section, table
 from avis_ctrl.report.rig_drawing import rig_drawing
 from avis_ctrl.rigs.instruments import Sensor
+from avis_ctrl.rigs.reduction_error import ReductionError
 from avis_ctrl.rigs.rig import Parameter, Rig
-from avis_ctrl.rigs.subsystem import ReductionError
 from avis_ctrl.simulation.sampled_loop import lever_arms
 from avis_ctrl.study.design_result import DesignResult
 from avis_ctrl.summary import joined
@@ -255,11 +255,11 @@ def _compared(error: ReductionError) -> Figure:
     largest = np.linalg.norm(error.left_out, ord=2, axis=(1, 2)) if error.left_out.size else np.zeros(f.size)
     curves.append(Curve(f, in_dB(largest), "from the floor's other axes", numbered(3)))
     gain, difference = Axis("gain [dB]", "linear", (-80.0, 40.0)), Axis("difference [dB]", "linear", (-140.0, 20.0))
-    left = Panel(hertz(), gain, curves, (), "transmissibility along each kept axis")
+    left = Panel(hertz(), gain, curves, (), "transmissibility along each controlled axis")
     right = Panel(hertz(), difference, apart, (), "difference, relative to the largest gain")
     return Figure(
         "reduction",
-        "Transmissibility without control, floor to payload along each kept axis: six degrees "
+        "Transmissibility without control, floor to payload along each controlled axis: six degrees "
         "of freedom (coloured) and the design model on top of it (black, dotted), with the contribution of "
         "the floor's other axes. Beside it, their difference.",
         (left, right),

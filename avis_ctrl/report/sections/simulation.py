@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Cell, Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
 from avis_ctrl.report.figures import PALETTE, STYLES, Axis, Curve, Figure, Panel, Style, hertz, markers
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, Table, listed, section, table, yes_or_no
 from avis_ctrl.simulation.design_check import PlantCheck, SimulationCheck
 from avis_ctrl.simulation.spectrum_check import SpectrumAgreement
-from avis_ctrl.study.companions import Companions
 from avis_ctrl.study.design_result import DesignResult
+from avis_ctrl.study.other_axes import Companions
 
 
 def simulation(result: DesignResult) -> Section:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Section, Table, section, table
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, controller_style, hertz
-from avis_ctrl.report.pieces import Paragraph, Section, Table, section, table
 from avis_ctrl.report.sections.transmissibility import left_out, nominal
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
@@ -16,7 +16,7 @@ def site(result: DesignResult) -> Section:
     """The section on the site."""
     floor = result.plant.floor
     text = (
-        f"The floor moves independently along each kept axis, each time with the spectrum {floor.name} "
+        f"The floor moves independently along each controlled axis, each time with the spectrum {floor.name} "
         f"({floor.source}); sensor noise is added. Nominal plant, linear model."
     )
     shown = (_third_octaves(result), _motion(result), _volts(result), _compliance(result))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Section, listed, section
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, level, log_limits, numbered
-from avis_ctrl.report.pieces import Section, listed, section
 from avis_ctrl.study.design_result import DesignResult
 
 
@@ -17,9 +17,9 @@ def synthesis(result: DesignResult) -> Section:
         'The iterations. Kind: "H-infinity", "nominal" (plant without uncertainty) and "given" (a controller '
         "for comparison) are initial controllers. Each later step is an H-infinity synthesis with scalings D: "
         '"D-K" fits them to the last loop, "start" restarts from the best constant ones, "descent" changes '
-        'them so that gamma falls, "growth" does so with scalings of higher order. Fit: by how much '
-        "the rational scalings D(s) raise the bound, compared with the best scalings at each frequency. The "
-        "controller with the smallest mu is used.",
+        'them so that gamma falls, "growth" does so with scalings of higher order. Fit error: increase of the upper '
+        "bound caused by fitting rational scalings D(s) to the best scalings at each frequency. The controller with "
+        "the smallest mu is used.",
         history,
         {
             "step": lambda h: str(h.iteration),
@@ -28,7 +28,7 @@ def synthesis(result: DesignResult) -> Section:
             "mu upper": lambda h: words.bound(h.mu_upper, 4),
             "order": lambda h: str(h.order),
             "order of D": lambda h: str(h.d_order),
-            "fit": lambda h: f"{words.number(100 * h.d_fit_error, 2)} %",
+            "fit error": lambda h: f"{words.number(100 * h.d_fit_error, 2)} %",
             "time": lambda h: f"{words.number(h.seconds, 2)} s",
         },
         "rlrrrrrr",

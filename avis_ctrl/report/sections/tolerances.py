@@ -8,7 +8,7 @@ import numpy as np
 
 from avis_ctrl.identification.priors import Tolerance
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Paragraph, Piece, headed, table
+from avis_ctrl.report.elements import Paragraph, Piece, headed, table
 from avis_ctrl.report.settings import SETTINGS
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Section, Table, listed, section
 from avis_ctrl.report.figures import STYLES, Axis, Band, Curve, Figure, Panel, Style, controller_style, hertz
-from avis_ctrl.report.pieces import Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.analysis import SETTINGS as CURVES
 from avis_ctrl.study.design_result import ControllerResult, DesignResult
@@ -26,7 +26,7 @@ def _against_skyhook(result: DesignResult) -> Table:
     low, high = result.design.transmissibility.band_Hz
     return listed(
         f"Worst case of each axis over {low:g} to {high:g} Hz, for floor motion in any combination of the "
-        "kept axes: upper bound of the mu controller over the whole set, and lower bound of the tuned skyhook, "
+        "controlled axes: upper bound of the mu controller over the whole set, and lower bound of the tuned skyhook, "
         "which a plant of the set reaches.",
         result.by_axis,
         {
@@ -154,6 +154,6 @@ def _six_dof(result: DesignResult) -> Figure:
         f"Check of the design model: the sampled mu controller on all six degrees of freedom, with the skyhook "
         f"loops of the other axes. In the band the largest gain differs by at most {check.deviation_dB:.2g} dB "
         "from that of the design model. The third line shows how floor motion along the other coordinates "
-        "reaches the kept axes."
+        "reaches the controlled axes."
     )
     return Figure("transmissibility_six_dof", caption, [_panel(curves)])

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from avis_ctrl.report import words
-from avis_ctrl.report.pieces import Cell, Mark, Paragraph, Section, listed, section, table, yes_or_no
+from avis_ctrl.report.elements import Cell, Mark, Paragraph, Section, listed, section, table, yes_or_no
 from avis_ctrl.report.sections.bounds import certificate, stable_for_the_set
 from avis_ctrl.report.sections.transmissibility import summary_figure
 from avis_ctrl.study.design_result import ControllerResult, DesignResult

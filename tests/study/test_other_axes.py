@@ -11,14 +11,14 @@ import pytest
 from avis_ctrl.classical.skyhook import Skyhook
 from avis_ctrl.errors import ComputationError
 from avis_ctrl.rigs.rig_file import load_rig
-from avis_ctrl.simulation.culprit import find_culprit
 from avis_ctrl.simulation.discrete import spectral_radius
+from avis_ctrl.simulation.instability_cause import find_cause
 from avis_ctrl.simulation.loop import simulate
 from avis_ctrl.simulation.sampled_response import sampled_response
 from avis_ctrl.study.analysis import analyse
-from avis_ctrl.study.companions import CompanionSettings, design_companions, until_stable
 from avis_ctrl.study.design_file import design_from_table
 from avis_ctrl.study.design_result import Candidate
+from avis_ctrl.study.other_axes import CompanionSettings, design_companions, until_stable
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.simulation import bare_loop
 from avis_ctrl.study.skyhooks import SETTINGS, classical_skyhook, critical_gains
@@ -65,7 +65,7 @@ def classical(bare):
 
 
 def test_the_classical_rule_is_unstable_with_1_Hz_geophones_and_x_and_y_are_named(bare, classical):
-    culprit = find_culprit(classical)
+    culprit = find_cause(classical)
     assert culprit.kind == "companions" and set(culprit.loops) <= {"x", "y"} and culprit.growth_per_s > 0
     without = {axis: loop for axis, loop in classical.loops.items() if axis not in culprit.loops}
     assert spectral_radius(replace(classical, loops=without)) < 1 <= culprit.radius

@@ -11,7 +11,7 @@ from avis_ctrl.errors import AvisError, InputError
 from avis_ctrl.identification import model_error
 from avis_ctrl.identification.campaign_fit import SETTINGS as FIT
 from avis_ctrl.identification.response import FLOOR, ResponseModel
-from avis_ctrl.identification.spread import kept_axes
+from avis_ctrl.identification.response_error import kept_axes
 from avis_ctrl.measurement.campaign import Campaign, Portion
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.measurement.frequency_response.best_linear import best_linear_approximation

@@ -6,10 +6,10 @@ import numpy as np
 
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Paragraph, Section, Table, section, table
 from avis_ctrl.report.figures import STYLES, Axis, Curve, Figure, Panel, Style, markers
 from avis_ctrl.report.identification.gates import warnings
 from avis_ctrl.report.identification.validation import errors, modes
-from avis_ctrl.report.pieces import Paragraph, Section, Table, section, table
 from avis_ctrl.report.sections.tolerances import tolerances
 from avis_ctrl.study.identification import Identification
 from avis_ctrl.summary import joined

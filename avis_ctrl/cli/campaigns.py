@@ -121,12 +121,12 @@ def simulate_campaign(
     effects: Annotated[Path | None, SIMULATE_CAMPAIGN("--effects")] = None,
     seed: Annotated[int, SIMULATE_CAMPAIGN("--seed")] = 1,
 ) -> None:
-    """Simulate a measurement campaign with the nonlinear model, to plan and rehearse an identification."""
+    """Simulate a measurement campaign with the nonlinear model, to plan an identification."""
     from avis_ctrl.files import write_whole
     from avis_ctrl.measurement.formats.hdf5 import write_campaign
     from avis_ctrl.rigs import load_rig
     from avis_ctrl.study.files import require_hdf5_output, require_output
-    from avis_ctrl.study.hidden_effects import rehearse_with_effects
+    from avis_ctrl.study.hidden_effects import campaign_with_effects
     from avis_ctrl.study.plan_file import default_plan, plan_toml, read_plan
 
     if out is not None:
@@ -153,19 +153,19 @@ def simulate_campaign(
     )
     with Progress(terminal) as progress:
         try:
-            rehearsal = rehearse_with_effects(
+            simulated = campaign_with_effects(
                 table, chosen, seed, lambda k, total, name: progress(f"record {name}, {k} of {total}")
             )
         except InputError as error:
             section = re.split(r"\W", error.field or "")[0]
             of_plan = plan and not error.file and section in type(chosen).model_fields
             raise (error.in_file(plan) if of_plan else error) from None
-        write_campaign(out, rehearsal.campaign)
-    for path, text in ((write_plan, plan_toml(chosen)), (truth, rehearsal.truth_toml())):
+        write_campaign(out, simulated.campaign)
+    for path, text in ((write_plan, plan_toml(chosen)), (truth, simulated.truth_toml())):
         if path:
             write_whole(path, text.encode())
-    terminal.print(*rehearsal.campaign.notes)
-    terminal.print(f"{out}: {len(rehearsal.campaign.records)} records, seed {seed}")
+    terminal.print(*simulated.campaign.notes)
+    terminal.print(f"{out}: {len(simulated.campaign.records)} records, seed {seed}")
 
 
 CONVERT = Options("""

@@ -8,9 +8,9 @@ import numpy as np
 
 from avis_ctrl.gap.result import Gap, PowerShares, RecordGap
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Fold, Paragraph, Piece, Section, Table, headed, section, shown, table
 from avis_ctrl.report.figures import Axis, Curve, Figure, Panel, Style, hertz, level, log_limits, markers, steps
 from avis_ctrl.report.gap.before_after import AFTER, BEFORE, NOISE
-from avis_ctrl.report.pieces import Fold, Paragraph, Piece, Section, Table, headed, section, shown, table
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 
@@ -29,9 +29,9 @@ HOW = {
     "remains after the linear response and the model's own nonlinear terms counts as noise and unmeasured inputs, "
     "which do not grow with the drives; this includes nonlinearity that is not in the model. Whatever is larger at a "
     "higher level counts as not linear.",
-    "one level": "At a single level and without lines that are free of the drives, noise cannot be distinguished "
-    'from nonlinearity that is not in the model: "not linear" contains only the model\'s own '
-    'nonlinear terms, and "unmeasured inputs" all else that does not follow the drives linearly.',
+    "one level": "With a single level and no lines where the drives are silent, noise cannot be distinguished from "
+    'nonlinearity that is not in the model. "Not linear" then contains only the model\'s own nonlinear terms; '
+    'everything else that is not linear in the drives counts as "unmeasured inputs".',
 }
 
 
@@ -110,8 +110,8 @@ def _explained(one: PowerShares) -> str:
     narrow = float(np.min(np.diff(one.bands_Hz)))
     return (
         f"Multiple coherence is the sum of the first two parts, those that are linear. {HOW[one.how]}{unknown} "
-        "Linear: the response of the model with smooth corrections and, if they fit much better, up to two shifted "
-        f"poles in each band. A narrower error of the model (bands are at least {words.number(narrow, 2)} Hz wide) is "
+        "The linear part is the response of the model with smooth corrections and, if they fit much better, up to two "
+        f"shifted poles in each band. A model error narrower than a band (at least {words.number(narrow, 2)} Hz) is "
         "partly counted as not linear."
     )
 

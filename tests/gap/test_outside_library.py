@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.effects.unnamed import unnamed_faults
+from avis_ctrl.gap.effects.outside_library import unnamed_faults
 from avis_ctrl.gap.motion_estimate import mount_rows
 from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.run import Run

@@ -66,7 +66,7 @@ class LinearMotor:
 
 
 @dataclass(frozen=True)
-class AvisTable(Rig):
+class IsolatorTable(Rig):
     """A table on isolators.
 
     inertia : (J1, J2, J3, J12, J13, J23) [kg m^2] about the centre of mass; the last three are the
@@ -119,7 +119,7 @@ class AvisTable(Rig):
     def drive_limits_V(self) -> np.ndarray:
         return np.array([drive.limit_V or self.limit_V for drive in self.all_drives])
 
-    def with_drives_limited(self, limit_V: float) -> AvisTable:
+    def with_drives_limited(self, limit_V: float) -> IsolatorTable:
         drives = tuple(replace(one, limit_V=min(one.limit_V, limit_V)) if one.limit_V else one for one in self.drives)
         return replace(self, limit_V=min(self.limit_V, limit_V), drives=drives)
 
@@ -232,11 +232,11 @@ class AvisTable(Rig):
             found[one.name] = (f"isolator{nearest + 1}.{AXES[k]}", float(np.sign(along))), bool(inside)
         return found
 
-    def with_channels_apart(self) -> AvisTable:
+    def with_channels_apart(self) -> IsolatorTable:
         """The same table with motors and geophones at positions that do not move with the isolators."""
         return replace(self, motors=(), drives=self.all_drives, geophones=None, instruments=self.all_instruments)
 
-    def with_directions_by(self, names: Collection[str]) -> AvisTable:
+    def with_directions_by(self, names: Collection[str]) -> IsolatorTable:
         """The same table, with the direction of each channel given by the two components that are among these names of
         parameters, if two are."""
 
@@ -247,7 +247,7 @@ class AvisTable(Rig):
         drives, instruments = (tuple(map(named, some)) for some in (self.drives, self.instruments))
         return replace(self, drives=drives, instruments=instruments)
 
-    def _with_values(self, values: dict[str, float]) -> AvisTable:
+    def _with_values(self, values: dict[str, float]) -> IsolatorTable:
         get = values.get
         tables = {
             "k": [list(i.stiffness) for i in self.isolators],
@@ -326,7 +326,7 @@ class AvisTable(Rig):
         )
         return (*attached, *self.instruments)
 
-    def with_sensor_gains(self, gains: Mapping[str, float]) -> AvisTable:
+    def with_sensor_gains(self, gains: Mapping[str, float]) -> IsolatorTable:
         g = self.geophones
         if g is not None:
             volts = (

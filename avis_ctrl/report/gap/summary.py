@@ -7,18 +7,19 @@ import numpy as np
 from avis_ctrl.gap.axis.result import AxisGap
 from avis_ctrl.gap.result import Gap
 from avis_ctrl.report import words
+from avis_ctrl.report.elements import Bullets, Paragraph, Section, Table, listed, section
 from avis_ctrl.report.gap import wording
 from avis_ctrl.report.gap.before_after import ladder
 from avis_ctrl.report.gap.remaining import next_step
 from avis_ctrl.report.identification.gates import warnings
-from avis_ctrl.report.pieces import Bullets, Paragraph, Section, Table, listed, section
 from avis_ctrl.report.settings import SETTINGS
 from avis_ctrl.study.gap import GapFinding
 from avis_ctrl.summary import joined
 
 CHANCES = (
     " The probability is relative to the candidates fitted in its place, including some faults outside the library; "
-    "it is at most 99 %. For hum, a converter and floor motion it is a confidence level: one minus the p-value of "
+    "no value above 99 % is reported. For hum, a converter and floor motion it is a confidence level: one minus the "
+    "p-value of "
     "the test that the signal is absent."
 )
 
@@ -74,10 +75,11 @@ def _stage(name: str) -> str:
 def named(gap: Gap | AxisGap, remark: str) -> Table:
     """The named effects with their sizes, traces (very small effects) last. remark : on their probabilities."""
     return listed(
-        "Named effects, with one standard deviation. Fraction of the gap: increase of the residual power on held-out "
-        "data if this effect alone is removed and nothing is fitted again, divided by the residual power beyond noise "
-        "of the model without effects; the fractions need not add up to 100 %. (In place of structural damping, the "
-        "mounts then have viscous damping that is equal at the suspension resonances.) Effects below 1 % are called "
+        "Named effects, with one standard deviation. Fraction of the gap: the increase of the residual power on "
+        "held-out "
+        "data when only this effect is removed, without a new fit, divided by the residual power beyond noise of the "
+        "model without effects. The fractions need not add up to 100 %. (Where structural damping is removed, viscous "
+        "damping equal to it at the suspension resonances takes its place.) Effects below 1 % are called "
         f"traces.{remark}",
         [*gap.effects, *gap.traces],
         {

@@ -1,4 +1,4 @@
-"""Rehearsal of an identification: a simulated campaign on a table that differs from its file by known amounts."""
+"""A simulated campaign on a table that differs from its file by known amounts, to try an identification."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Campaign
-from avis_ctrl.rigs.avis import INERTIA, AvisTable
 from avis_ctrl.rigs.halcyonics import Halcyonics
 from avis_ctrl.rigs.instruments import Triple, triple
+from avis_ctrl.rigs.isolator_table import INERTIA, IsolatorTable
 from avis_ctrl.rigs.key_types import unit_vector
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
@@ -39,7 +39,7 @@ SETTINGS = DrawSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Rehearsal:
+class PerturbedCampaign:
     """A campaign and, separate from it, the truth.
 
     truth : the simulated table. true_values : the parameters that were changed, by flat name.
@@ -63,13 +63,13 @@ class Rehearsal:
         return rig_toml(self.truth, values, "\n".join(header))
 
 
-def rehearse(
+def perturbed_campaign(
     rig: Rig,
     plan: CampaignPlan,
     seed: int = 1,
     progress: Progress | None = None,
     hidden: Callable[[Rig], SensorChange] | None = None,
-) -> Rehearsal:
+) -> PerturbedCampaign:
     """Perturb the rig as specified in `plan.truth` and simulate the campaign on it; raises the errors of
     `simulate_campaign`.
 
@@ -82,7 +82,7 @@ def rehearse(
     campaign = simulate_campaign(
         rig, plan, seed, truth=truth, progress=progress, change=None if hidden is None else hidden(truth)
     )
-    return Rehearsal(
+    return PerturbedCampaign(
         campaign,
         truth,
         changed,
@@ -125,7 +125,7 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
         }
         try:
             truth = rig.with_parameters(changes)
-            if isinstance(truth, AvisTable) and rig.tolerances is not None and changes:
+            if isinstance(truth, IsolatorTable) and rig.tolerances is not None and changes:
                 truth = within_tolerances(truth, rng)
             rig_from(tomllib.loads(rig_toml(truth)), loaded=getattr(rig, "load", None) is not None)
         except InputError as error:
@@ -139,7 +139,7 @@ def perturbed_truth(rig: Rig, percent: float = 5.0, damping_percent: float = 20.
     )
 
 
-def within_tolerances(rig: AvisTable, rng: np.random.Generator) -> AvisTable:
+def within_tolerances(rig: IsolatorTable, rng: np.random.Generator) -> IsolatorTable:
     """A table drawn from normal distributions about the rig, with the [tolerances] of its file as standard deviations.
 
     Corner frequencies and damping ratios of sensors are unchanged: in a rig file a compensation filter matches its

@@ -5,7 +5,7 @@ import pytest
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.rigs import load_rig
-from avis_ctrl.rigs.subsystem import reduction_error
+from avis_ctrl.rigs.reduction_error import reduction_error
 
 KEEP = [2, 3]
 OMEGA = 2 * np.pi * np.array([0.2, 1.7, 3.1, 4.9, 8.3, 30.0])

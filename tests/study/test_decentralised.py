@@ -12,8 +12,8 @@ from avis_ctrl.errors import ComputationError
 from avis_ctrl.lti import lft_lower
 from avis_ctrl.rigs.rig_file import load_rig
 from avis_ctrl.robust.mu_peak import mu_peak
+from avis_ctrl.study.decentralised import tuned_loops
 from avis_ctrl.study.design_file import design_from_table, read_study
-from avis_ctrl.study.loops import tuned_loops
 from avis_ctrl.study.plant import build_plant
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.roll_off import gain_limit

@@ -53,9 +53,9 @@ class AtRest:
     def words(self) -> str:
         """The effect of the offsets as a sentence without a full stop."""
         return (
-            f"offsets of up to {1e3 * np.max(self.offset_V, initial=0.0):.3g} mV per channel cost up to "
+            f"offsets of up to {1e3 * np.max(self.offset_V, initial=0.0):.3g} mV per channel require up to "
             f"{self.drive_V[self.worst]:.3g} V of {self.limits_V[self.worst]:g} V (drive "
-            f"{self.drives[self.worst]}; gain at rest {np.max(np.abs(self.gain_V_per_V)):.3g} V/V, "
+            f"{self.drives[self.worst]}; gain at zero frequency {np.max(np.abs(self.gain_V_per_V)):.3g} V/V, "
             f"{self.gain_Ns_per_m:.3g} N s/m)"
         )
 

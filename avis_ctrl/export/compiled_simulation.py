@@ -18,7 +18,7 @@ from avis_ctrl.study.simulation import with_delta
 
 
 @dataclass(frozen=True)
-class ReplaySettings:
+class CompiledSimulationSettings:
     """settle_s : time before the measurement; covers the start of the code and the slowest poles of such loops, about
     0.02 Hz. periods : number of whole periods of the sine that are measured. velocity_rms : r.m.s. of the floor's sine
     over the site's velocity; the table is then as nonlinear as at the site."""
@@ -29,7 +29,7 @@ class ReplaySettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class CompiledSimulation:
     """gain : payload velocity over floor velocity of the kept axes, in the worst direction of the sine; inf if the loop
     diverged. record : of the measured periods."""
 
@@ -37,13 +37,13 @@ class Replay:
     record: SimulationRecord
 
 
-def replay_worst_plant(
+def simulate_worst_plant(
     folder: DesignFolder,
     certificate: Certificate,
     controller: SampledController,
     files: Mapping[str, str],
-    settings: ReplaySettings = ReplaySettings(),
-) -> Replay:
+    settings: CompiledSimulationSettings = CompiledSimulationSettings(),
+) -> CompiledSimulation:
     """Move the floor of the worst plant with a sine at the worst frequency, in the worst direction.
 
     The motion caused by sensor and converter noise is subtracted. It comes from a second simulation with the same noise
@@ -68,9 +68,9 @@ def replay_worst_plant(
     code = CompiledController(files, controller)
     record = simulate(loop, measured / rate, settle_s=settle / rate, floor=floor, code=code.step)
     if record.diverged:
-        return Replay(np.inf, record)
+        return CompiledSimulation(np.inf, record)
     code.reset()
     noise = simulate(loop, measured / rate, settle_s=settle / rate, floor=0 * floor, code=code.step)
     wave = np.exp(-1j * worst.omega * (record.time + settle / rate))[:, None]
     moved = 2 * np.mean((record.q_dot - noise.q_dot)[:, kept] * arms * wave, axis=0)
-    return Replay(float(np.linalg.norm(moved) / size), record)
+    return CompiledSimulation(float(np.linalg.norm(moved) / size), record)

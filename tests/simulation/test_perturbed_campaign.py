@@ -8,7 +8,7 @@ from avis_ctrl.measurement.campaign import digest
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.simulation.campaign_data import simulate_campaign
 from avis_ctrl.simulation.campaign_plan import CampaignPlan
-from avis_ctrl.simulation.rehearsal import perturbed_truth, rehearse
+from avis_ctrl.simulation.perturbed_campaign import perturbed_campaign, perturbed_truth
 
 PLAN = {
     "duration_s": 5.0,
@@ -37,9 +37,9 @@ def test_truths_spread_as_far_as_asked_and_no_farther(name, stiff, damped):
     assert perturbed_truth(rig, 5.0, 20.0, 7) == perturbed_truth(rig, 5.0, 20.0, 7)
 
 
-def test_a_rehearsal(tmp_path):
+def test_a_perturbed_campaign(tmp_path):
     rig, plan = load_rig("avis"), CampaignPlan.model_validate(PLAN)
-    done = rehearse(rig, plan, 4)
+    done = perturbed_campaign(rig, plan, 4)
     assert done.truth == perturbed_truth(rig, 5.0, 20.0, 4) and len(done.true_values) == 4 + 12 + 12
     assert digest(done.campaign) == digest(simulate_campaign(rig, plan, 4, truth=done.truth))
     assert digest(done.campaign) != digest(simulate_campaign(rig, plan, 4))

@@ -11,7 +11,7 @@ from exact import floor_velocity, record
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.model_error import measured_response, unexplained
 from avis_ctrl.identification.response import ResponseModel
-from avis_ctrl.identification.spread import FrfSpread, frf_spread, kept_axes
+from avis_ctrl.identification.response_error import FrfSpread, frf_spread, kept_axes
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.measurement.frequency_response import FrequencyResponse
 from avis_ctrl.rigs import load_rig

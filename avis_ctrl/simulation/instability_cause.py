@@ -17,7 +17,7 @@ from avis_ctrl.summary import joined
 
 
 @dataclass(frozen=True)
-class Culprit:
+class InstabilityCause:
     """The cause of an instability of the linear sampled loop.
 
     Attributes
@@ -63,7 +63,7 @@ class Culprit:
         return f"{how}: {who}"
 
 
-def find_culprit(loop: SampledLoop) -> Culprit:
+def find_cause(loop: SampledLoop) -> InstabilityCause:
     """Cause of the instability of one plant's loop; no loop is named if the linear loop is stable."""
     values, vectors = la.eig(period_map(loop))
     most = int(np.argmax(np.abs(values)))
@@ -73,7 +73,7 @@ def find_culprit(loop: SampledLoop) -> Culprit:
     axes = tuple(COORDINATES[k] for k in order if motion[k] >= 0.3 * motion[order[0]])
     radius = float(np.abs(values[most]))
     kind, loops = _who(loop) if radius >= 1 else ("nonlinear", ())
-    return Culprit(loop.name, radius, float(abs(rate.imag)) / (2 * np.pi), float(rate.real), axes, kind, loops)
+    return InstabilityCause(loop.name, radius, float(abs(rate.imag)) / (2 * np.pi), float(rate.real), axes, kind, loops)
 
 
 def _who(loop: SampledLoop) -> tuple[str, tuple[str, ...]]:

@@ -106,7 +106,7 @@ class SensorCrosstalkOfAll(UnnamedFault):
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
         return tuple(
-            EffectParameter(f"share_of_{name}", "1", f"share of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
+            EffectParameter(f"share_of_{name}", "1", f"fraction of {name}'s signal", 0.0, -2.0, 2.0, 0.01)
             for name in model.sensors.names
             if name != place
         )
@@ -119,7 +119,7 @@ class SensorLate(OfSensor, Late):
     """One output is later than the others: a low-pass filter or a delay of its own."""
 
     name = "sensor_late"
-    words = "a low pass or a delay of {place} alone"
+    words = "a low-pass filter or a delay in {place} only"
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
         ops.sense[:, ops.sensor(place)] *= self.factor(ops.s, values)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avis_ctrl.gap import power_shares as shares
-from avis_ctrl.gap.power_shares import Lines, Split, attributed, bands, lines_of, power_shares, split
+from avis_ctrl.gap import power_fractions as shares
+from avis_ctrl.gap.power_fractions import Lines, Split, attributed, bands, lines_of, power_shares, split
 from avis_ctrl.gap.table_model import TableModel
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.prediction_error import PredictionError
