@@ -23,7 +23,8 @@ CAMPAIGN: records of the rig: HDF5, .mat, UFF 58 or CSV
 --band LOW HIGH: fitted band [Hz]; by default the excited band
 --amplifier-corner: expected corner of the amplifiers' first-order lag [Hz]; by default none, or 300 Hz on a rig with
     accelerometers. The time constant is fitted (docs/gap_engine.md)
---design: also design controllers on both models, to show the influence of the effect on mu (about a minute more)
+--design: also design controllers on both models, to show the influence of the effect on mu (about a minute more);
+    the default design is for a table on isolators
 --design-file DESIGN.toml: as --design, with the axes, uncertainty and weights of this file instead of the default
     design for z and phi_x
 --effects FILE.py: Python file with effects of your own, run before the search (docs/own_effect.md)

@@ -117,7 +117,7 @@ def identify(
     Raises
     ------
     InputError : records of another table, a gate (check of the records) with severity "stop", options that do not fit.
-    ComputationError : a fit that does not converge.
+    ComputationError : no fit is possible. A fit that does not converge gives a warning through `progress`.
 
     Examples
     --------

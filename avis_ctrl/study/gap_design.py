@@ -230,7 +230,9 @@ def design_for(rig: Rig, design: Path | Design | None = None) -> Design:
     """The design that `design_effect` uses on a rig. Raises InputError as it does, before any computation."""
     if design is None:
         if not isinstance(rig, IsolatorTable):
-            raise InputError(f"there is a default for the AVIS only: give a design file for {rig.name}", field="design")
+            raise InputError(
+                f"there is a default only for tables on isolators: give a design file for {rig.name}", field="design"
+            )
         keep = " and ".join(default_keep(rig))
         return default_design(
             rig, f"{rig.name}: {keep} under one controller, weights chosen for the AVIS", PARAMETERS_PERCENT

@@ -130,7 +130,7 @@ def identify(
     Raises
     ------
     InputError : records of another rig, a gate that reports a stop, options that do not fit.
-    ComputationError : a fit that does not converge.
+    ComputationError : no fit is possible. A fit that does not converge gives a warning through `progress`.
     """
     options, began = options or IdentifyOptions(), time.monotonic()
     measured = with_rig_names(rig, measured)
