@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from enum import Enum
 from html import escape
+from math import isfinite
 from textwrap import fill
 from typing import Any, ClassVar
 
 
 @dataclass(frozen=True)
 class SummarySettings:
-    """longest : maximum number of characters of a value in a repr or table. line : line width for wrapped sentences."""
+    """longest : maximum number of characters of a value in a repr or table. line : line width for wrapped sentences.
+    digits : significant digits of a number in a repr or table.
+    """
 
     longest: int = 60
     line: int = 100
+    digits: int = 5
 
 
 SETTINGS = SummarySettings()
@@ -24,6 +29,23 @@ SETTINGS = SummarySettings()
 def wrapped(sentence: str) -> str:
     """Wrap a sentence to the width of a terminal."""
     return fill(sentence, SETTINGS.line)
+
+
+def rounded_up(value: float, digits: int) -> float:
+    """The value with significant digits, rounded up: for upper bounds, which hold for larger values only."""
+    return _directed(value, digits, ROUND_CEILING)
+
+
+def rounded_down(value: float, digits: int) -> float:
+    """The value with significant digits, rounded down: for lower bounds."""
+    return _directed(value, digits, ROUND_FLOOR)
+
+
+def _directed(value: float, digits: int, rounding: str) -> float:
+    if not isfinite(value) or value == 0:
+        return value
+    exact = Decimal(float(value))
+    return float(exact.quantize(Decimal(1).scaleb(exact.adjusted() - digits + 1), rounding=rounding))
 
 
 def digits_apart(value: float, limit: float, least: int) -> int:
@@ -36,7 +58,7 @@ def in_short(value: Any) -> str:
     if isinstance(value, bool) or value is None:
         return str(value)
     if isinstance(value, (int, float)):
-        return f"{value:.5g}"
+        return f"{value:.{SETTINGS.digits}g}"
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return in_short(value.item()) if not value.shape else f"array{tuple(value.shape)}"
     if isinstance(value, dict):
@@ -93,4 +115,13 @@ class Shown:
         return html_table(self._facts(), title=type(self).__name__)
 
     def _facts(self) -> list[tuple[str, str]]:
-        return [(one.name, in_short(getattr(self, one.name))) for one in fields(self)]  # type: ignore[arg-type]
+        return [(one.name, _fact(one.name, getattr(self, one.name))) for one in fields(self)]  # type: ignore[arg-type]
+
+
+def _fact(name: str, value: Any) -> str:
+    """A field in short; an upper bound is rounded up, a lower bound down."""
+    if isinstance(value, float) and "upper" in name:
+        value = rounded_up(value, SETTINGS.digits)
+    elif isinstance(value, float) and "lower" in name:
+        value = rounded_down(value, SETTINGS.digits)
+    return in_short(value)

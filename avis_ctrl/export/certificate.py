@@ -22,8 +22,17 @@ from avis_ctrl.simulation.sampled_loop import SampledLoop
 from avis_ctrl.study.dc_gain import at_rest
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
+from avis_ctrl.summary import digits_apart, rounded_up
 
 Progress = Callable[[str], None]
+
+
+# Of the bounds (docs/export.md).
+ASSUMPTIONS = (
+    "beyond the eighth pair of images, the bounds of aliasing decrease as 1/n^2",
+    "between the centres of the intervals, the influence of rounded coefficients is at most twice as large as there",
+    "above half the sample rate, the loop gain between the computed frequencies does not exceed 1",
+)
 
 
 @dataclass(frozen=True)
@@ -54,15 +63,21 @@ class Certificate:
             "peak": c["worst_case_peak_transmissibility_dB"],
             "band": c["worst_case_band_transmissibility_dB"],
         }
-        text = {
-            name: "unbounded" if value is None or not np.isfinite(value) else f"{value:.4g}"
-            for name, value in known.items()
-        }
-        proved = "proved between frequencies" if c["guaranteed"] else "not proved"
+        text = {name: _upper(value) for name, value in known.items()}
+        proved = (
+            "proved between frequencies under the assumptions of docs/export.md" if c["guaranteed"] else "not proved"
+        )
         return (
             f"mu at most {text['mu']}, worst-case transmissibility at most {text['peak']} dB, in the band "
             f"{text['band']} dB, {'stable' if c['stable'] else 'not stable'}, {proved}"
         )
+
+
+def _upper(value: float | None) -> str:
+    """An upper bound with four significant digits, rounded up; more if it would look like 1."""
+    if value is None or not np.isfinite(value):
+        return "unbounded"
+    return f"{rounded_up(value, digits_apart(value, 1.0, 4)):.9g}"
 
 
 def shipped_loop(folder: DesignFolder, controller: SampledController) -> SampledLoop:
@@ -116,6 +131,7 @@ def certify(
         "mu_upper": found.mu.upper,
         "mu_lower": lower,
         "guaranteed": not unproved,
+        "assumptions": list(ASSUMPTIONS),
         "stable": not unstable and bool(np.isfinite(found.peak.upper)) and found.gain_above < 1,
         "worst_case_peak_transmissibility_dB": decibels(found.peak.upper),
         "worst_case_band_transmissibility_dB": decibels(found.band.upper),

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.errors import ComputationError
+from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.bilinear import continuous_image, sampled_frequency
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.lti.statespace import StateSpace
@@ -72,6 +72,8 @@ def hinf_norm(system: Any, tolerance: float = 1e-6) -> PeakGain:
     (5.0252, 0.9899)
     """
     system = as_system(system)
+    if not 0 < tolerance < 1:
+        raise InputError("expected a number between 0 and 1", field="tolerance", value=tolerance)
     if not system.is_stable():
         return PeakGain(np.inf, np.nan)
     if system.dt:

@@ -9,7 +9,6 @@ The operators keep the signal names; those of python-control do not.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -40,14 +39,29 @@ class ResponseSettings:
         row by row, all other work is matrix products.
     probes : number of frequencies at which a response is checked by elimination, which is slow.
     tolerance : largest relative difference accepted there [1]: far above the round-off of a well scaled system.
+    null : singular value of s I - A relative to the largest, and part of an input or output relative to its norm, that
+        counts as zero at a pole s [1]: some rounding errors.
     """
 
     block: int = 16
     probes: int = 6
     tolerance: float = 1e-6
+    null: float = 1e-13
 
 
 SETTINGS = ResponseSettings()
+
+
+def real_array(given: Any, field: str) -> np.ndarray:
+    """Floating-point array of real numbers. Raises InputError for anything else, complex numbers included."""
+    try:
+        array = np.asarray(given)
+        real = np.asarray(array.real if np.iscomplexobj(array) else array, float)
+    except (TypeError, ValueError):
+        raise InputError("expected real numbers, in rows of equal length", field=field) from None
+    if np.iscomplexobj(array) and np.any(array.imag):
+        raise InputError("expected real numbers", field=field)
+    return real
 
 
 def as_names(given: Iterable[str] | None) -> Names:
@@ -114,13 +128,11 @@ class StateSpace:
     states: Names = field(default=())
 
     def __post_init__(self) -> None:
-        D = np.atleast_2d(np.asarray(self.D, dtype=float))
+        A, B, C = (real_array(getattr(self, name), f"matrix {name}") for name in "ABC")
+        D = np.atleast_2d(real_array(self.D, "matrix D"))
         n_y, n_u = D.shape
-        A = np.asarray(self.A, dtype=float)
         A = A.reshape(0, 0) if A.size == 0 else np.atleast_2d(A)
         n = A.shape[0]
-        B = np.asarray(self.B, dtype=float)
-        C = np.asarray(self.C, dtype=float)
         B = B.reshape(n, n_u) if B.size == 0 else B
         C = C.reshape(n_y, n) if C.size == 0 else C
         if A.shape != (n, n) or B.shape != (n, n_u) or C.shape != (n_y, n):
@@ -131,7 +143,7 @@ class StateSpace:
             matrix = matrix.copy()
             matrix.setflags(write=False)
             object.__setattr__(self, name, matrix)
-        if not (np.isfinite(self.dt) and self.dt >= 0):
+        if not (isinstance(self.dt, (int, float, np.number)) and np.isfinite(self.dt) and self.dt >= 0):
             raise InputError(f"dt must be 0 (continuous) or a positive number of seconds, not {self.dt!r}")
         object.__setattr__(self, "dt", float(self.dt))
         object.__setattr__(self, "inputs", signal_names(self.inputs, n_u, "u", "input"))
@@ -471,9 +483,12 @@ def _table(given: Any, field: str) -> list[list[np.ndarray]]:
         raise InputError("expected coefficients, or rows with coefficients for each input", field=field)
     try:
         rows = given if depth == 3 else [[given]]
-        return [[np.trim_zeros(np.atleast_1d(np.asarray(one, float)), "f") for one in row] for row in rows]
-    except (TypeError, ValueError):
-        raise InputError("expected coefficients, or rows with coefficients for each input", field=field) from None
+        table = [[np.trim_zeros(np.atleast_1d(real_array(one, field)), "f") for one in row] for row in rows]
+    except (TypeError, InputError):
+        raise InputError("expected real coefficients, or rows with coefficients for each input", field=field) from None
+    if not all(np.isfinite(one).all() for row in table for one in row):
+        raise InputError("expected finite coefficients", field=field)
+    return table
 
 
 def _proper(num: np.ndarray, den: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -582,7 +597,8 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
         return _eliminated(A, B, C, points)
     balanced, (scale, _) = la.matrix_balance(A, permute=False, separate=True)
     T, U = la.schur(balanced, output="complex")
-    response = _back_substituted(T, U.conj().T @ (B / scale[:, None]), (C * scale) @ U, points)
+    with np.errstate(divide="ignore", invalid="ignore"):  # at poles, which are computed again below
+        response = _back_substituted(T, U.conj().T @ (B / scale[:, None]), (C * scale) @ U, points)
     order = np.argsort(np.abs(points))
     place = np.unique(np.linspace(0, points.size - 1, SETTINGS.probes).astype(int))
     probes = order[place]
@@ -594,18 +610,40 @@ def _resolvent(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) 
     error = np.linalg.norm(response[probes[finite]] - exact[finite], axis=(1, 2))
     wrong[finite] = ~(error <= SETTINGS.tolerance * size)
     doubtful = order[np.interp(np.arange(points.size), place, wrong) > 0]
+    doubtful = np.union1d(doubtful, np.flatnonzero(~np.isfinite(response).all(axis=(1, 2))))
     response[doubtful] = _eliminated(A, B, C, points[doubtful])
     return response
 
 
 def _eliminated(A: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """C inv(s I - A) B point by point; inf where s is a pole."""
+    """C inv(s I - A) B point by point; inf in the entries of which s is a pole."""
     identity, right = np.eye(A.shape[0]), B.astype(complex)
-    response = np.full((points.size, C.shape[0], B.shape[1]), np.inf, complex)
+    response = np.empty((points.size, C.shape[0], B.shape[1]), complex)
     for k, s in enumerate(points):
-        with contextlib.suppress(np.linalg.LinAlgError):
+        try:
             response[k] = C @ np.linalg.solve(s * identity - A, right)
+        except np.linalg.LinAlgError:
+            response[k] = _at_pole(s * identity - A, right, C)
     return response
+
+
+def _at_pole(M: np.ndarray, B: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """C inv(M) B for a singular M = s I - A: inf in the entries that see a mode at s, the others without this mode; inf
+    in all entries if s is a defective eigenvalue.
+
+    With M V = 0, U^H M = 0 and the projector P = V inv(U^H V) U^H, the rest is the x with M x = (I - P) b and P x = 0.
+    """
+    left, sizes, right = np.linalg.svd(M)
+    none = sizes <= SETTINGS.null * sizes[0]
+    U, V = left[:, none], np.conj(right[none].T)
+    overlap = np.conj(U.T) @ V
+    if np.linalg.norm(overlap, -2) <= SETTINGS.null**0.5:
+        return np.full((C.shape[0], B.shape[1]), np.inf, complex)
+    P = V @ np.linalg.solve(overlap, np.conj(U.T))
+    x = np.linalg.lstsq(M, B - P @ B, rcond=SETTINGS.null)[0]
+    seen = np.linalg.norm(C @ V, axis=1) > SETTINGS.null * np.linalg.norm(C, axis=1)
+    excited = np.linalg.norm(np.conj(U.T) @ B, axis=0) > SETTINGS.null * np.linalg.norm(B, axis=0)
+    return np.where(np.outer(seen, excited), np.inf, C @ (x - P @ x))
 
 
 def _back_substituted(T: np.ndarray, B: np.ndarray, C: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.plot.axes import HERTZ, axes_of, finish, limit_line, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
+from avis_ctrl.summary import digits_apart, rounded_down, rounded_up
 
 # Palette of Okabe and Ito; controllers have the same colours as in the report.
 COLOURS = {
@@ -53,13 +54,14 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
     if np.isfinite(peak.upper):
         worth = "proved between all points" if peak.guaranteed else "at the computed points only"
-        limit_line(ax, peak.upper, f"peak below {peak.upper:.4g}, {worth}", color=color, linestyle="--")
+        upper = rounded_up(peak.upper, digits_apart(peak.upper, 1.0, 4))
+        limit_line(ax, peak.upper, f"peak at most {upper:.9g}, {worth}", color=color, linestyle="--")
     if np.isfinite(peak.lower) and peak.lower > 0 and np.isfinite(peak.omega):
         at = peak.omega / HERTZ
         # Zero has no place on the axis. With real parameters alone, mu can be zero at all other frequencies.
         x, y = ([at], [peak.lower]) if at > 0 else ([], [])
         ax.vlines(x, 0, y, color=color, linewidth=0.8, linestyle=":")
-        words = f"reached: {peak.lower:.4g} at {at:.4g} Hz"
+        words = f"reached: {rounded_down(peak.lower, 4):.4g} at {at:.4g} Hz"
         ax.plot(x, y, "o", color=color, markersize=5, fillstyle="none", label=words)
     ax.set_ylim(bottom=0)
     return finish(ax, "frequency [Hz]", label, above=True)
@@ -71,8 +73,8 @@ def transmissibility(result: Any, ax: Any = None, *, controllers: Iterable[str] 
     Parameters
     ----------
     result : a design's result (of `avis_ctrl.design` or `run_design`).
-    controllers : names of the controllers to draw; all by default. The range of sampled plants and the certified
-        worst-case peak (dashed line) are drawn for the last controller.
+    controllers : names of the controllers to draw; all by default. The range of sampled plants and the upper bound
+        of the worst-case peak (dashed line) are drawn for the last controller.
 
     Raises
     ------

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
+from avis_ctrl.summary import rounded_down, rounded_up
 from avis_ctrl.uncertain_value import rounded
 
 AXIS_WORDS = {"phi_x_edge": "phi_x (edge)", "phi_y_edge": "phi_y (edge)", "phi_z_edge": "phi_z (edge)"}
@@ -53,6 +55,16 @@ def bound(value: float, digits: int = 3) -> str:
     return "no bound" if np.isinf(value) else number(value, digits)
 
 
+def upper(value: float, digits: int = 3) -> str:
+    """An upper bound, rounded up."""
+    return bound(rounded_up(value, digits), digits)
+
+
+def lower(value: float, digits: int = 3) -> str:
+    """A lower bound, rounded down."""
+    return bound(rounded_down(value, digits), digits)
+
+
 def percent(share: float, digits: int = 3) -> str:
     """A fraction in per cent; "< 0.001 %" if it is smaller."""
     if not np.isfinite(share):
@@ -60,13 +72,17 @@ def percent(share: float, digits: int = 3) -> str:
     return "< 0.001 %" if 0 < share < 1e-5 else f"{number(100 * share, digits)} %"
 
 
-def decibel(gain: float) -> str:
-    """A gain in dB, with its sign."""
+def decibel(gain: float, side: Literal["", "upper", "lower"] = "") -> str:
+    """A gain in dB, with its sign. side : "upper" (rounded up) or "lower" (rounded down) for a bound."""
     if np.isnan(gain):
         return "not computed"
     if np.isinf(gain):
         return "no bound"
-    return f"{20 * np.log10(gain):+.1f} dB".replace("-", "−") if gain > 0 else "none"
+    if gain <= 0:
+        return "none"
+    tenths = 200 * np.log10(gain)
+    tenths = {"upper": np.ceil, "lower": np.floor}.get(side, np.round)(tenths)
+    return f"{tenths / 10:+.1f} dB".replace("-", "−")
 
 
 def quantity(value: float, unit: str, digits: int = 3) -> str:

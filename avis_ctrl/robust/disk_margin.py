@@ -7,12 +7,13 @@ and phases about 1 with skew sigma. The largest alpha is 1/mu of S + (sigma - 1)
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from avis_ctrl.errors import ComputationError, InputError
+from avis_ctrl.lti import StateSpace
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_peak import SETTINGS as PEAK
 from avis_ctrl.robust.mu_peak import MuPeak, mu_peak
@@ -27,10 +28,13 @@ At = Literal["outputs", "inputs", "both"]
 
 @dataclass(frozen=True)
 class DiskMarginSettings:
-    """steps : number of mu computations of a worst-case margin, which double alpha and then bisect: eleven resolve a
-    margin of 2 to one part in a thousand, which is always sufficient."""
+    """resolution : relative width of the interval to which the bisection of a worst-case margin reduces alpha.
+    largest : alpha at which the search for a worst-case margin ends, the disk then being almost the whole plane or its
+        complement; it also ends at the inverse, where the loop is almost unstable.
+    """
 
-    steps: int = 11
+    resolution: float = 1e-3
+    largest: float = 1e3
 
 
 SETTINGS = DiskMarginSettings()
@@ -119,12 +123,39 @@ def disk_margin(
             if K is not None
             else "give -L if its controller has u = K y",
         )
-    place = np.concatenate([np.arange(w.start, w.stop) for block, w, _ in blocks.slices() if block.name in names])
+    places = {block.name: w.start for block, w, _ in blocks.slices() if block.name in names}
+    place = np.array(list(places.values()), int)
     if place.size == blocks.n_w:
-        peak = mu_peak(N, blocks, slack=slack)
+        peak = _peak(N, blocks, slack)
         lower, upper = (1 / bound if bound > 0 else np.inf for bound in (peak.upper, peak.lower))
-        return _margin(lower, upper, peak.omega, peak.delta, peak, skew)
-    return _worst_case(N, blocks, place, skew, slack)
+        found = _margin(lower, upper, peak.omega, peak.delta, peak, skew)
+    else:
+        found = _worst_case(N, blocks, place, skew, slack)
+    return _with_open_channels(found, names, list(places), skew)
+
+
+def _peak(N: StateSpace, blocks: BlockStructure, slack: float) -> MuPeak:
+    """`mu_peak`; zero if no factor is part of a loop."""
+    if blocks.blocks:
+        return mu_peak(N, blocks, slack=slack)
+    none = np.zeros(0)
+    return MuPeak(0.0, 0.0, 0.0, None, True, "no factor is part of a loop", none, none, none)
+
+
+def _with_open_channels(found: DiskMargin, names: list[str], closed: list[str], skew: float) -> DiskMargin:
+    """The margin with the factors of all channels; that of a channel in no loop is infinite only at 2/(1 + sigma)."""
+    if len(closed) == len(names):
+        return found
+    delta = None
+    if found.delta is not None:
+        delta = np.zeros((len(names), len(names)), found.delta.dtype)
+        at = [names.index(name) for name in closed]
+        delta[np.ix_(at, at)] = found.delta
+    own = 2 / (1 + skew) if skew > -1 else np.inf
+    if own > found.lower:
+        return replace(found, delta=delta)
+    delta = np.diag([0.0 if name in closed else own for name in names])
+    return _margin(own, own, 0.0, delta, found.mu, skew)
 
 
 def _factors(name: str, n: int, skew: float) -> tuple[UncertainSystem, list[str]]:
@@ -178,7 +209,7 @@ def _worst_case(N: Any, blocks: BlockStructure, place: np.ndarray, skew: float, 
         )
     proved, unproved, alpha = 0.0, np.inf, 1.0
     counter: tuple[float, MuPeak] | None = None
-    for _ in range(SETTINGS.steps):
+    while 1 / SETTINGS.largest <= alpha <= SETTINGS.largest and unproved > (1 + SETTINGS.resolution) * proved:
         found = scaled(alpha)
         if found.upper < 1:
             proved, peak = alpha, found

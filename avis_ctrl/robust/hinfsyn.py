@@ -423,6 +423,8 @@ def _rate_note(result: Synthesis, sample_rate_Hz: float | None) -> tuple[str, ..
         return ()
     if not (np.isfinite(sample_rate_Hz) and sample_rate_Hz > 0):
         raise InputError("expected a positive rate in hertz", field="sample_rate_Hz", value=sample_rate_Hz)
+    if result.K.dt:  # a sampled controller is used as it is
+        return ()
     ratio = result.fastest_pole / (np.pi * sample_rate_Hz)
     verdict = (
         "slow enough"

@@ -46,7 +46,12 @@ class MuBounds(Shown):
 def checked(M: Array, blocks: BlockStructure | Sequence[Block]) -> tuple[Array, BlockStructure]:
     """M as complex (n_omega, n_z, n_w) and its block structure; InputError if they do not fit."""
     structure = BlockStructure.of(blocks)
-    M = np.asarray(M, complex)
+    if not structure.blocks:
+        raise InputError("expected at least one block", field="blocks")
+    try:
+        M = np.asarray(M, complex)
+    except (TypeError, ValueError):
+        raise InputError("expected a matrix of numbers", field="M") from None
     if M.ndim not in (2, 3):
         raise InputError("expected (n_z, n_w) or (n_omega, n_z, n_w)", field="shape of M", value=M.shape)
     if M.shape[-2:] != (structure.n_z, structure.n_w):
@@ -86,6 +91,8 @@ def mu(M: Array, blocks: BlockStructure | Sequence[Block], tolerance: float = 1e
     (0.8583, 0.8583)
     """
     stack, structure = checked(M, blocks)
+    if not 0 < tolerance < 1:
+        raise InputError("expected a number between 0 and 1", field="tolerance", value=tolerance)
     with one_thread():
         bound = upper_bound(stack[:, None], structure, tolerance)
         found = lower_bound(stack, structure, bound.beta, bound.scalings)

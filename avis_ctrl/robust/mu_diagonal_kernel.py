@@ -184,16 +184,19 @@ def follow_diagonal(
                 speed += towards[k] * (slope[k] - 2 * falling[k]) - copies[k] * (towards[k] / p[k]) ** 2
             whole = at - max(floor[b], 0.0)
             fall = min(whole, settings.first / np.sqrt(max(speed, 1e-300)))
+            # d p / d lambda = -towards: lambda decreases, p moves along `towards`. Two points are checked, as in
+            # `mu_kernel.follow_path`.
             for _ in range(40):
-                # d p / d lambda = -towards: lambda decreases, p moves along `towards`.
-                if _inside(M[b], p + fall * towards, at - fall, of_z, of_w, F):
+                step = fall if fall >= whole else settings.reach * fall
+                if _inside(M[b], p + fall * towards, at - fall, of_z, of_w, F) and (
+                    step == fall or _inside(M[b], p + step * towards, at - step, of_z, of_w, F)
+                ):
                     break
                 fall *= settings.shrink
             else:
                 break
             last = fall <= tolerance * at
-            if fall < whole:
-                fall *= settings.reach
+            fall = step
             p, at = p + fall * towards, at - fall
             if last:
                 found[b], level[b] = p, at

@@ -307,15 +307,19 @@ def follow_path(
                 break
             whole = at - max(floor[b], 0.0)
             fall = min(whole, settings.first / max(_speed(M[b], x, at, direction, form, core), 1e-300))
+            # F contains lambda times the scalings, so that the line may leave the set and enter it again: the point
+            # that is used is checked, and one further on, which keeps it away from the boundary.
             for _ in range(40):
-                if _inside(M[b], x - fall * direction, at - fall, form, core):
+                step = fall if fall >= whole else settings.reach * fall
+                if _inside(M[b], x - fall * direction, at - fall, form, core) and (
+                    step == fall or _inside(M[b], x - step * direction, at - step, form, core)
+                ):
                     break
                 fall *= settings.shrink
             else:
                 break
             last = fall <= tolerance * at
-            if fall < whole:
-                fall *= settings.reach
+            fall = step
             x -= fall * direction
             lam[b] = at - fall
             theta[b] = x

@@ -102,7 +102,8 @@ def mu_peak(
     N : stable system (avis_ctrl or python-control) with sum(cols) outputs z and sum(rows) inputs w.
     band : (low, high) in rad/s; the Nyquist frequency replaces infinity for sampled systems.
     known_upper : a bound that the caller has proved for the whole band, such as the measured norm of the loop scaled
-        by a realised D(s); it is used as the upper bound if it is within 0.5 % of the level to be proved.
+        by a realised D(s); if it is within 0.5 % of the level to be proved, it is used as the upper bound without
+        another proof, and `guaranteed` is true if the caller's bound is.
     slack : relative amount by which the level to be proved exceeds the highest value found; a larger slack needs fewer
         intervals. If mu is flat over frequency, the level is raised further (see `mu_cover`).
 
@@ -318,17 +319,26 @@ def _mu_peak(
     # One stage is enough for the curve; the search continues at the peaks only.
     lower = lower_bound(N.frequency_response(omega), structure, *bound, enough=0.9, stages=1)
     done = _cover_mu(N, structure, level, accuracy, slack)
-    if known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * level:
+    given = known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * level
+    if known_upper is not None and given:
         done.level = known_upper
     else:
         done.run(band, peak)
+    # The proof finds resonances that are narrower than the spacing of the frequencies computed before.
+    if (missed := np.setdiff1d(done.raised_at, omega)).size:
+        more = bound_of_peak((M := N.frequency_response(missed))[:, None], structure, accuracy)
+        lower = joined([lower, lower_bound(M, structure, *more, enough=0.9, stages=1)])
+        omega, bound = np.concatenate([omega, missed]), joined([bound, more])
+        order = np.argsort(omega)
+        omega, bound, lower = omega[order], selected(bound, order), selected(lower, order)
     best, at, delta = _best_singular(N, structure, omega, bound, lower, done, band)
     if best > done.level:
         # mu of real blocks can jump at a single frequency outside any grid; the search with free frequency found one.
-        done = _cover_mu(N, structure, best * (1 + slack), accuracy, slack).run(band, np.array([at]))
+        done, given = _cover_mu(N, structure, best * (1 + slack), accuracy, slack).run(band, np.array([at])), False
     if best == 0.0:
         at = float(peak[0])
-    return MuPeak(done.level, best, at, delta, not done.gaps, _in_words(done, band, dt), omega, bound.beta, lower.beta)
+    words = f"{_span(band, dt)}: the bound that was given" if given else _in_words(done, band, dt)
+    return MuPeak(done.level, best, at, delta, not done.gaps, words, omega, bound.beta, lower.beta)
 
 
 def _cover_mu(N: StateSpace, structure: BlockStructure, level: float, accuracy: float, slack: float) -> Cover:
@@ -391,6 +401,13 @@ def _worst_case_gain(
     if np.all(np.isfinite(upper)) and (proved or _robustly_stable(N.select(range(n_z), range(n_w)), structure, band)):
         done = Cover(N, whole, scaled, bound, _level(upper, slack), slack).run(band, omega[[int(np.argmax(upper))]])
     if done is not None and np.isfinite(done.level):
+        if (missed := np.setdiff1d(done.raised_at, searched)).size:
+            M = N.frequency_response(missed)
+            searched, reached = np.concatenate([searched, missed]), joined([reached, worst_gain(M, structure)])
+            kept = np.concatenate([kept, np.arange(searched.size - missed.size, searched.size)])
+            kept = kept[np.argsort(searched[kept])]
+            upper = np.concatenate([upper, bound(M[:, None])])[np.argsort(np.concatenate([omega, missed]))]
+            omega = searched[kept]
         k = int(np.argmax(reached.gain))
         return MuPeak(
             done.level,
@@ -403,7 +420,7 @@ def _worst_case_gain(
             upper,
             reached.gain[kept],
         )
-    robust = known or _mu_peak(N.select(range(n_z), range(n_w)), structure, ALL_FREQUENCIES, slack)
+    robust = known or _robustness(N.select(range(n_z), range(n_w)), structure, slack)
     if robust.lower >= 1.0:
         return _destabilised(N, structure, robust, omega)
     gain, delta = _gain_of_stable(N.frequency_response(omega), structure, robust)
@@ -436,6 +453,13 @@ def _gain_of_stable(M: Array, structure: BlockStructure, robust: MuPeak) -> tupl
     return found.gain, radius * found.delta
 
 
+def _robustness(N: StateSpace, structure: BlockStructure, slack: float) -> MuPeak:
+    """Bounds of mu without the performance channel; blocks that are in a loop only through this channel are removed."""
+    part = coupled(N, structure)
+    found = _mu_peak(balance(part.N), part.structure, ALL_FREQUENCIES, slack)
+    return replace(found, delta=part.restored(found.delta))
+
+
 def _robustly_stable(N: StateSpace, structure: BlockStructure, band: Interval) -> bool:
     """Whether mu < 1 is proved at all frequencies; a cover of all frequencies with performance implies it."""
     if band == ALL_FREQUENCIES:
@@ -452,9 +476,7 @@ def _stable_cover(N: StateSpace, structure: BlockStructure) -> Cover:
 
 def _in_words(done: Cover, band: Interval, dt: float) -> str:
     """Description of what was proved, in frequencies of the system (sampled at dt), not of its image."""
-    end = "half the sample rate" if dt else "infinity"
-    low, high = sampled_frequency(band[0], dt), sampled_frequency(band[1], dt)
-    span = f"all frequencies from 0 to {end}" if band == ALL_FREQUENCIES else f"{low:g} to {high:g} rad/s"
+    span = _span(band, dt)
     if not done.gaps:
         return f"{span}: {done.intervals} intervals with constant scalings prove the upper bound between the points"
     shown = ", ".join(f"{sampled_frequency(a, dt):.6g} to {sampled_frequency(b, dt):.6g}" for a, b in done.gaps[:3])
@@ -462,3 +484,9 @@ def _in_words(done: Cover, band: Interval, dt: float) -> str:
         f"the frequencies computed within {span}; not proved in {len(done.gaps)} gaps ({shown} rad/s) at the "
         f"level {done.level:.6g}"
     )
+
+
+def _span(band: Interval, dt: float) -> str:
+    end = "half the sample rate" if dt else "infinity"
+    low, high = sampled_frequency(band[0], dt), sampled_frequency(band[1], dt)
+    return f"all frequencies from 0 to {end}" if band == ALL_FREQUENCIES else f"{low:g} to {high:g} rad/s"

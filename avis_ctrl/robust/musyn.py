@@ -333,6 +333,9 @@ def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, given_n
     has_real = any(block.kind == "real" for block in uncertainty.blocks)
     mu_upper = min(peak.upper, gamma)
     complex_upper = gamma if has_real else mu_upper
+    if has_real and gamma > (1 + SETTINGS.tight) * best.mu:
+        # Rational scalings of acceptable order do not reach complex mu: it is bounded with scalings for each interval.
+        complex_upper = min(gamma, mu_peak(closed, uncertainty.complexified()).upper)
     fastest = float(np.max(np.abs(best.K.poles()), initial=0.0))
     notes = [*given_notes]
     if has_real:
@@ -340,7 +343,7 @@ def _result(made: DKIteration, best: Loop, sample_rate_Hz: float | None, given_n
             f"the synthesis treats real blocks as complex: peak mu {complex_upper:.4g} with complex "
             f"blocks, {mu_upper:.4g} with real ones"
         )
-    if sample_rate_Hz is not None:
+    if sample_rate_Hz is not None and not P.dt:
         ratio = fastest / (np.pi * sample_rate_Hz)
         notes.append(f"fastest controller pole {fastest:.4g} rad/s is {ratio:.3g} times half the sample rate")
     guaranteed = peak.guaranteed or mu_upper == gamma

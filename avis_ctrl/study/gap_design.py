@@ -41,6 +41,7 @@ from avis_ctrl.study.gap_plant import (
 from avis_ctrl.study.gap_uncertainty import FitUncertainty, fit_uncertainty
 from avis_ctrl.study.identification_design import default_design, default_keep
 from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
+from avis_ctrl.summary import rounded_up
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
 Progress = Callable[[str], None]
@@ -303,16 +304,18 @@ def _outcome(
     before: LoopFigures, after: LoopFigures | None, new: LoopFigures | None, target: float | None, held: str = "all"
 ) -> list[str]:
     """mu of the three loops in words; held : "all", "some" or "none" of the updated model's effects are in its loop."""
+    mu, mu_after, mu_new = (
+        "" if one is None else f"mu of at most {rounded_up(one.mu_upper, 3):.3g}" for one in (before, after, new)
+    )
     if after is None:
         return [
-            f"The controller designed on the re-identified model has mu of at most {before.mu_upper:.3g} there; no "
-            "named effect "
-            "changes the model, so nothing else was computed."
+            f"The controller designed on the re-identified model has {mu} there; no named effect changes the model, so "
+            "nothing else was computed."
         ]
-    first = f"The controller designed on the re-identified model has mu of at most {before.mu_upper:.3g} there and "
+    first = f"The controller designed on the re-identified model has {mu} there and "
     if after.stable:
         verdict = f"{_verdict(before.mu_upper, after.mu_upper, held)}; {_worst_case(before, after)}"
-        first += f"of at most {after.mu_upper:.3g} on the updated model: {verdict}."
+        first += f"{mu_after} on the updated model: {verdict}."
     else:
         first += "makes the updated model unstable."
     if after.stable and before.stable_in_six and not after.stable_in_six:
@@ -325,9 +328,7 @@ def _outcome(
     bounds = f"worst case {new.worst_peak_dB:.1f} dB at the peak, {new.worst_band_dB:.1f} dB in the band"
     if not np.isfinite(new.worst_peak_dB):
         bounds = "stability is not proved for every table within the design's uncertainty"
-    second = (
-        f"A controller designed on the updated model has mu of at most {new.mu_upper:.3g} there and {reach} ({bounds})."
-    )
+    second = f"A controller designed on the updated model has {mu_new} there and {reach} ({bounds})."
     if target and after.mu_upper < new.mu_upper < 1:
         second += f" Synthesis stops near its target of {target:g}: it does not search for the lowest mu."
     return [first, second if new.stable_in_six else f"{second} With all six coordinates the loop is unstable."]

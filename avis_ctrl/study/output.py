@@ -99,6 +99,7 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
         "gamma": c.gamma,
         "mu_upper": c.mu.upper,
         "mu_lower": c.mu.lower,
+        "guaranteed": c.mu.guaranteed and c.worst_peak.guaranteed and c.worst_band.guaranteed,
         "mu_peak_Hz": c.mu.omega / (2 * np.pi),
         "stable": c.stable,
         "peak_transmissibility_dB": decibels(c.peak_transmissibility),
@@ -110,7 +111,9 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
 
 def _failed_row(c: FailedController) -> dict[str, Any]:
     """Row of a controller that could not be analysed; the note has the reason."""
-    figures = "gamma mu_upper mu_lower mu_peak_Hz peak_transmissibility_dB worst_case_peak_transmissibility_dB"
+    figures = (
+        "gamma mu_upper mu_lower guaranteed mu_peak_Hz peak_transmissibility_dB worst_case_peak_transmissibility_dB"
+    )
     unknown = dict.fromkeys(["file", "order", *figures.split(), "at_rest"])
     return {"name": c.name, "kind": c.kind, "stable": False, **unknown, "note": c.reason}
 

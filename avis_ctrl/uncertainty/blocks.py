@@ -28,7 +28,7 @@ class Block:
 
     def __post_init__(self) -> None:
         for label, size in (("rows", self.rows), ("cols", self.cols)):
-            if not isinstance(size, (int, np.integer)) or size < 1:
+            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
                 raise InputError("a block needs a whole number of at least 1", field=label, value=size)
 
     @property
@@ -121,6 +121,8 @@ class BlockStructure:
         """From any sequence of blocks; InputError for anything else."""
         if isinstance(blocks, BlockStructure):
             return blocks
+        if not isinstance(blocks, (Block, Sequence)):
+            raise InputError("expected a sequence of blocks", field="blocks", value=blocks)
         blocks = (blocks,) if isinstance(blocks, Block) else tuple(blocks)
         for block in blocks:
             if not isinstance(block, Block):

@@ -19,12 +19,16 @@ class SpreadSettings:
         from one to the next.
     reach : factor in frequency [1] by which the fit extends beyond the data (and beyond a declared crossover), so that
         the filter follows the ends of the envelope.
+    dense : number of frequencies at which the filter is compared with the envelope between the points of the fit.
+    between : relative amount by which the filter may be below the envelope there [1].
     slopes, orders : slopes of the envelope [decades per decade] and largest orders of its filter: the flatter envelope
         is used if order 6 cannot follow the steep one.
     """
 
     points_per_octave: int = 8
     reach: float = 10.0
+    dense: int = 4000
+    between: float = 1e-4
     slopes: tuple[float, ...] = (2.0, 1.0)
     orders: tuple[int, ...] = (6, 12)
 
@@ -38,7 +42,7 @@ class IdentifiedSpread(Weight):
 
     The envelope is the smallest curve above the data with slopes of at most `slope` decades per decade, constant
     outside the measured band, or `declared` where that is larger. The filter has the lowest order with which it is
-    above the envelope by at most `tolerance_dB`.
+    above the envelope by about `tolerance_dB` at most (`slack_dB` is the result).
 
     Parameters
     ----------
@@ -88,12 +92,20 @@ class IdentifiedSpread(Weight):
     @cached_property
     def shape(self) -> Rational:
         curve = self.envelope(self.grid)
-        return smallest_cover(self.grid, curve, curve, self.tolerance_dB, self.max_order, "the identified spread")
+        shape = smallest_cover(self.grid, curve, curve, self.tolerance_dB, self.max_order, "the identified spread")
+        lacking = float(np.max(self.envelope(self._dense) / shape.magnitude(self._dense)))
+        return shape.scaled(lacking * (1 + SETTINGS.between)) if lacking > 1 + SETTINGS.between else shape
+
+    @cached_property
+    def _dense(self) -> np.ndarray:
+        """Frequencies [rad/s] on and between those of the fit, and beyond them."""
+        low, high = self.grid[0] / SETTINGS.reach, self.grid[-1] * SETTINGS.reach
+        return np.union1d(self.grid, np.geomspace(low, high, SETTINGS.dense))
 
     @cached_property
     def slack_dB(self) -> float:
         """Maximum excess of the filter over the envelope."""
-        return float(20 * np.max(np.log10(self.shape.magnitude(self.grid) / self.envelope(self.grid))))
+        return float(20 * np.max(np.log10(self.shape.magnitude(self._dense) / self.envelope(self._dense))))
 
     @property
     def meaning(self) -> str:

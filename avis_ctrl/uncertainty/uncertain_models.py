@@ -10,7 +10,7 @@ import numpy as np
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti import connect as connect_systems
 from avis_ctrl.lti.interchange import as_system
-from avis_ctrl.lti.statespace import StateSpace, as_names
+from avis_ctrl.lti.statespace import StateSpace, as_names, real_array
 from avis_ctrl.lti.statespace import tf as tf_of_numbers
 from avis_ctrl.uncertainty.elements import ComplexDisk, Dynamics, Element, RealParameter
 from avis_ctrl.uncertainty.uncertain_system import STATES, UncertainSystem, as_uncertain, ordered, reduced, stacked
@@ -65,7 +65,7 @@ def complex_disk(name: str, centre: float = 0.0, radius: float = 1.0) -> Uncerta
     >>> ac.complex_disk("spring", 2.0, 0.1)                 # a spring with unknown loss
     UncertainSystem(number: spring within 0.1 of 2 (complex), 1 copy)
     """
-    element = ComplexDisk(name, 1, 1, float(centre), float(radius))
+    element = ComplexDisk(name, 1, 1, *(float(real_array(one, name)) for one in (centre, radius)))
     return of_element(element, element.lft())
 
 
@@ -114,6 +114,8 @@ def matrix(rows: Sequence[Sequence[Any]] | Any) -> UncertainSystem:
     """
     if isinstance(rows, UncertainSystem):
         return rows
+    if not isinstance(rows, (list, tuple)) and np.ndim(rows) == 0:
+        rows = [[rows]]
     table = [list(row) if isinstance(row, (list, tuple, np.ndarray)) else [row] for row in rows]
     if not table or len({len(row) for row in table}) != 1:
         raise InputError("expected rows of one length", field="matrix", value=[len(row) for row in table])

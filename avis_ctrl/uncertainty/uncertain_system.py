@@ -225,6 +225,8 @@ class UncertainSystem:
     def values(self, n: int = 1, seed: int = 0) -> list[dict[str, Any]]:
         """n random sets of values for `substitute`: real parameters are uniform over their range; complex ones and
         dynamics are a first-order all-pass times a gain of at most 1, with a corner in the system's frequency range."""
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 0:
+            raise InputError("expected a whole number", field="n", value=n)
         rng = np.random.default_rng(seed)
         grid = np.array([0.1, 10.0])
         if self.nstates:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.lti.interchange import frequencies_of, is_response, plot_frequencies, response_of
+from avis_ctrl.lti.interchange import as_system, frequencies_of, is_response, plot_frequencies, response_of
 from avis_ctrl.lti.rational import Rational
 from avis_ctrl.summary import Shown
 from avis_ctrl.uncertainty.weight_base import Weight, smallest_cover
@@ -25,10 +25,16 @@ Kind = Literal["output", "input", "additive"]
 @dataclass(frozen=True)
 class CoverSettings:
     """round_off : relative size below which the part of an error outside the range of the nominal system is round-off.
-    followed : errors below this fraction of the largest are covered, but not followed closely."""
+    followed : errors below this fraction of the largest are covered, but not followed closely.
+    rest : frequencies at which the error at zero frequency is fitted, relative to the lowest positive one: a
+        logarithmic axis has no zero, and the filter has to be constant towards it.
+    margin : relative amount added to a filter that touches the error, so that round-off does not lie below it.
+    """
 
     round_off: float = 1e-8
     followed: float = 1e-4
+    rest: tuple[float, ...] = (1e-5, 1e-4, 1e-3)
+    margin: float = 1e-12
 
 
 SETTINGS = CoverSettings()
@@ -51,7 +57,13 @@ class UncertaintyWeight(Shown, Weight):
     @cached_property
     def shape(self) -> Rational:
         floor = np.maximum(self.error, SETTINGS.followed * np.max(self.error))
-        return smallest_cover(self.omega, floor, floor, self.tolerance_dB, self.max_order, "the error")
+        omega = self.omega
+        if omega[0] == 0:
+            low = omega[1] * np.array(SETTINGS.rest)
+            omega, floor = np.r_[low, omega[1:]], np.r_[np.full(low.size, floor[0]), floor[1:]]
+        found = smallest_cover(omega, floor, floor, self.tolerance_dB, self.max_order, "the error")
+        lacking = float(np.max(self.error / found.magnitude(self.omega)))
+        return found.scaled(max(1.0, lacking) * (1 + SETTINGS.margin))
 
     @property
     def order(self) -> int:
@@ -91,7 +103,8 @@ def uncertainty_weight(
     Raises
     ------
     InputError : no responses, responses of another shape, a nominal response that is zero or not finite, an error that
-        cannot be referred to this side of the nominal system (for example, with fewer inputs than outputs).
+        cannot be referred to this side of the nominal system (for example, with fewer inputs than outputs), a system
+        with another number of unstable poles than the nominal one (no stable Delta makes it), no positive frequency.
     ComputationError : no filter up to this order is within the tolerance.
 
     Examples
@@ -110,8 +123,18 @@ def uncertainty_weight(
     if omega is None:
         known = [frequencies_of(one) for one in (nominal, *every) if is_response(one)]
         omega = known[0] if known else plot_frequencies(nominal, 120)
-    omega = np.asarray(omega, float)
-    omega = omega[omega > 0]
+    omega = np.unique(np.asarray(omega, float))
+    if not (omega.size and np.all(np.isfinite(omega)) and omega[0] >= 0 and omega[-1] > 0):
+        raise InputError("expected frequencies from 0 on, one of them positive", field="omega")
+    unstable = [None if is_response(one) else _unstable_poles(one) for one in (nominal, *every)]
+    for k, count in enumerate(unstable[1:]):
+        if None not in (count, unstable[0]) and count != unstable[0]:
+            raise InputError(
+                f"expected {unstable[0]} unstable poles, as many as those of the nominal system: no stable Delta makes "
+                "this system from the nominal one",
+                field=f"response {k}",
+                value=count,
+            )
     G = response_of(nominal, omega, "nominal")
     error = np.zeros(omega.size)
     for k, one in enumerate(every):
@@ -122,6 +145,8 @@ def uncertainty_weight(
                 field=f"response {k}",
                 value=difference.shape[1:],
             )
+        if not np.all(np.isfinite(difference)):
+            raise InputError("expected finite numbers", field=f"response {k}")
         difference = difference - G
         if kind != "additive":
             inverse, whole = np.linalg.pinv(G), difference
@@ -139,3 +164,10 @@ def uncertainty_weight(
     made = UncertaintyWeight(omega, error, kind, tolerance_dB, max_order)
     _ = made.shape
     return made
+
+
+def _unstable_poles(given: Any) -> int:
+    """Number of poles that are not stable."""
+    system = as_system(given)
+    poles = system.poles()
+    return int(np.sum(np.abs(poles) >= 1 if system.dt else poles.real >= 0))

@@ -16,7 +16,8 @@ class TransmissibilityBound(Weight):
     """Payload motion over floor motion: at most `peak_dB`, and inside band_Hz at most band_dB.
 
     A rational filter has no steps. On the grid it is nowhere less strict than specified. Within `transition_octaves`
-    outside a stricter band it may be stricter than specified, elsewhere by at most `tolerance_dB`. It has the lowest
+    outside a stricter band it may be stricter than specified, elsewhere by about `tolerance_dB` at most (`excess_dB` is
+    the result). It has the lowest
     order that achieves this. The limit applies from a hundredth of the lower to a hundred times the upper edge of the
     band, and the filter is flat outside.
     """
@@ -69,10 +70,17 @@ class TransmissibilityBound(Weight):
         low, high = self.band_Hz
         return (
             f"transmissibility at most {self.peak_dB:+g} dB, at most {self.band_dB:+g} dB from {low:g} to {high:g} Hz; "
-            f"realised with {self.shape.order} states; up to {self.tolerance_dB:g} dB stricter than these bounds, "
-            "and possibly "
-            f"more within {self.transition_octaves:g} octave of the edges of the band"
+            f"realised with {self.shape.order} states; more than {self.transition_octaves:g} octave from the edges of "
+            f"the band, it is up to {self.excess_dB:.2g} dB stricter than these bounds"
         )
+
+    @cached_property
+    def excess_dB(self) -> float:
+        """By how much the filter is stricter than the bounds, at most, outside the transitions [dB]."""
+        f = self._grid(4000, 400)
+        away = np.min(np.abs(np.log2(f[:, None] / np.array(self.band_Hz))), axis=1) >= self.transition_octaves
+        omega = 2 * np.pi * f[away]
+        return float(20 * np.log10(np.max(self.asked(omega) * self.shape.magnitude(omega))))
 
 
 @dataclass(frozen=True)

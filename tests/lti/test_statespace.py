@@ -62,12 +62,12 @@ def test_tf_of_several_channels_is_that_of_python_control(rng):
 @pytest.mark.parametrize(
     "num, den, message",
     [
-        ([[1.0, 2.0]], [1.0, 1.0], "expected coefficients"),
+        ([[1.0, 2.0]], [1.0, 1.0], "expected (real )?coefficients"),
         ([[[1.0], [1.0]], [[1.0]]], [1.0, 1.0], "tables of 2 rows"),
         ([[[1.0]], [[1.0, 0.0]]], [[[1.0]], [[1.0]]], "improper"),
-        ([], [1.0], "expected coefficients"),
+        ([], [1.0], "expected (real )?coefficients"),
         ([[[1.0]]], [[[0.0]]], "denominator is zero"),
-        ("ab", [1.0], "expected coefficients"),
+        ("ab", [1.0], "expected (real )?coefficients"),
     ],
 )
 def test_tables_that_are_no_transfer_function(num, den, message):
@@ -208,6 +208,12 @@ def test_a_wrong_number_of_state_names_is_refused():
 def test_gain_at_a_pole_is_infinite_as_in_python_control():
     G = tf([1.0], [1.0, 0.0])
     assert G.dcgain() == control.dcgain(G.to_control()) == np.inf and np.isinf(G(0.0))
+    other = append(tf([1.0], [1.0, 0.0]), tf([1.0], [1.0, 1.0]))
+    np.testing.assert_array_equal(other.dcgain(), [[np.inf, 0], [0, 1]])
+    np.testing.assert_array_equal(other.frequency_response(np.arange(6.0))[0], [[np.inf, 0], [0, 1]])
+    # One input drives both, the second output sees the stable mode only: 2/(s + 1), 2 at rest.
+    shared = StateSpace([[0.0, 0.0], [0.0, -1.0]], [[1.0], [2.0]], [[1.0, 1.0], [0.0, 1.0]], np.zeros((2, 1)))
+    np.testing.assert_allclose(shared.dcgain(), [[np.inf], [2.0]])
 
 
 def test_a_string_is_one_name_and_a_number_closes_each_channel(rng):
@@ -260,3 +266,19 @@ def test_whether_a_matrix_can_be_inverted_does_not_depend_on_units(rng, uncertai
 def test_an_unstable_system_says_so(pole, dt, said):
     """An integrator is not called unstable: most controllers with integral action would be."""
     assert said in repr(StateSpace([[pole]], [[1.0]], [[1.0]], [[0.0]], dt))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: StateSpace(np.array([[-1 + 2j]]), [[1]], [[1]], [[0]]), "matrix A: expected real numbers"),
+        (lambda: StateSpace([[1, 2], [3]], [[1]], [[1]], [[0]]), "matrix A: .* rows of equal length"),
+        (lambda: StateSpace([[-1]], [[1]], [[1]], [[0]], dt=None), "dt must be 0"),
+        (lambda: tf(np.array([1 + 1j]), [1, 1]), "numerator: expected real coefficients"),
+        (lambda: tf([1.0], [1.0, np.nan]), "denominator: expected finite"),
+    ],
+)
+def test_numbers_that_are_not_real_and_finite_are_refused_in_one_line(call, words):
+    with pytest.raises(InputError, match=words) as caught:
+        call()
+    assert "\n" not in str(caught.value)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from avis_ctrl.errors import ComputationError, InputError
-from avis_ctrl.lti import StateSpace, discretise, tf
+from avis_ctrl.lti import StateSpace, append, discretise, tf
 from avis_ctrl.robust.disk_margin import disk_margin
 from avis_ctrl.uncertainty.uncertain_models import real
 
@@ -104,6 +104,22 @@ def test_the_worst_case_over_an_uncertain_gain_is_that_of_the_worst_gain():
     least = min(disk_margin(k * L).lower for k in np.linspace(0.8, 1.2, 9))
     assert found.lower == pytest.approx(least, rel=3e-3) and found.lower <= least * 1.001 <= found.upper * 1.003
     assert found.delta is not None and abs(found.delta[0, 0]) <= found.upper * 1.01
+
+
+def test_a_channel_in_no_loop_does_not_change_the_margin():
+    """A factor outside every loop is infinite at delta = 2, and harms nothing else (S + (sigma - 1)/2 I with S = 1)."""
+    alone = disk_margin(L)
+    zero = StateSpace([], [], [], [[0.0]])
+    both = disk_margin(append(tf([25.0], [1.0, 10.0, 10.0, 10.0]), zero))
+    assert both.lower == pytest.approx(alone.lower) and both.upper == pytest.approx(alone.upper)
+    assert both.delta.shape == (2, 2) and both.delta[1, 1] == 0 and both.delta[0, 0] == pytest.approx(alone.delta[0, 0])
+    assert disk_margin(zero).lower == disk_margin(zero).upper == 2.0
+
+
+def test_a_large_worst_case_margin_is_resolved_as_well_as_a_small_one():
+    found = disk_margin(real("k", 1.0, percent=10) * tf([0.3], [1.0, 1.0, 1.0]), skew=-1)
+    of_the_largest = disk_margin(tf([0.33], [1.0, 1.0, 1.0]), skew=-1)
+    assert found.lower <= of_the_largest.upper and found.lower == pytest.approx(of_the_largest.lower, rel=5e-3)
 
 
 @pytest.mark.parametrize(

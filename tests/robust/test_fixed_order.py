@@ -35,6 +35,16 @@ def peak_by_slicot(loop: StateSpace, structure: BlockStructure = ONE_DRIVE) -> f
     return max(mu_upper_slicot(M, structure) for M in loop.frequency_response(omega))
 
 
+@pytest.mark.slow
+def test_complex_mu_of_a_controller_of_low_order_is_not_the_norm_with_poor_scalings():
+    """Scalings that were fitted to the full controller are poor for one of two states: their norm is far above mu."""
+    result = musyn(*table(), 1, 1, max_iterations=3, polish=False, order=2)
+    omega = np.concatenate([np.geomspace(1e-2, 1e5, 400), np.abs(result.closed_loop.poles())])
+    complex_blocks = result.blocks.complexified()
+    on_grid = np.max(upper_bound(result.closed_loop.frequency_response(omega)[:, None], complex_blocks).beta)
+    assert on_grid * (1 - 1e-6) <= result.mu_upper_complex <= 1.01 * on_grid
+
+
 @pytest.fixture(scope="module")
 def full():
     """A table with one uncertain drive: six states, mu 1.02; truncated to one state 6.7."""

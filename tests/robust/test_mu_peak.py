@@ -234,6 +234,24 @@ def test_narrow_resonance_between_grid_points():
     assert found.upper == pytest.approx(1e-6 / (2e-7 * 3.7), rel=1e-3) and found.omega == pytest.approx(3.7, rel=1e-6)
 
 
+@pytest.mark.parametrize("zeta", [1e-4, 1e-5, 1e-6])
+def test_the_lower_bound_is_searched_where_the_proof_found_a_resonance(zeta):
+    """One complex block: mu is the gain. The mode at 0.06 rad/s is narrower than the spacing of the frequencies."""
+    w0 = 0.06
+    mode = StateSpace(
+        [[-zeta * w0, w0], [-w0, -zeta * w0]], [[0.0], [np.sqrt(zeta * w0)]], [[np.sqrt(zeta * w0), 0.0]], [[-1.0]]
+    )
+    N = mode + tf([0.014], [1.0, 0.012, 36.0])
+    found = mu_peak(N, [C()])
+    exact = hinf_norm(N, 1e-9).gain
+    assert exact * (1 - 1e-3) <= found.lower <= exact * (1 + 1e-6) and exact <= found.upper * (1 + 1e-6)
+
+
+def test_a_bound_that_was_given_is_not_called_a_proof():
+    found = mu_peak(tf([1], [1, 0.1, 1]), [C()], known_upper=10.02)
+    assert found.upper == 10.02 and found.covers.endswith("the bound that was given")
+
+
 def test_spike_of_a_real_parameter_away_from_every_pole():
     """1 + delta L(s), L = 2/(s+1)^3: the phase is -180 degrees at sqrt(3) alone, |L| = 1/4 there; L(0) = 2."""
     N = -tf([2], [1, 3, 3, 1])

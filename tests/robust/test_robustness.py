@@ -16,6 +16,7 @@ from avis_ctrl.robust.mu_peak import mu_peak
 from avis_ctrl.robust.robustness import robust_performance, robust_stability, worst_case_gain, worst_values
 from avis_ctrl.uncertainty.blocks import ComplexScalar, RealScalar
 from avis_ctrl.uncertainty.uncertain_models import complex_disk, dynamics, matrix, real, ss
+from avis_ctrl.uncertainty.uncertain_models import tf as uncertain_tf
 from avis_ctrl.uncertainty.uncertainty_weight import uncertainty_weight
 
 # Skogestad and Postlethwaite, Multivariable Feedback Control, 2005: plant of section 2.6, weights of example 2.17.
@@ -98,6 +99,24 @@ def test_the_worst_case_can_be_substituted_and_has_the_reported_gain(seed, dt):
     assert gain >= (1 - 1e-5) / performance.upper
 
 
+@pytest.mark.parametrize("band", [(0.0, np.inf), (5.0, 20.0), (7.0, 15.0), (9.0, 12.0)])
+def test_the_worst_case_gain_near_a_resonance(band):
+    """(s + 1)/(s^2 + c s + k) is largest with the least damping; the maximum over k and frequency by a search."""
+    k, c = real("k", 100.0, percent=20), real("c", 0.1, percent=40)
+    found = worst_case_gain(uncertain_tf([1.0, 1.0], [1.0, c, k]), band=band)
+    stiffness, omega = np.linspace(80, 120, 41)[:, None], np.sqrt(80) + np.linspace(-0.05, 0.05, 20001)
+    exact = np.max(np.abs((1j * omega + 1) / (-(omega**2) + 0.06j * omega + stiffness)))
+    assert exact * (1 - 1e-3) <= found.lower <= exact * (1 + 1e-6) <= found.upper * (1 + 1e-6) <= exact * (1 + 2e-3)
+
+
+def test_a_block_that_only_performance_closes_does_not_hide_an_instability():
+    """delta acts from d to e only. k destabilises at 0.5 of its range: the gain is infinite."""
+    k, d = real("k", 1.0, percent=200), complex_disk("d", 1.0, 0.5)
+    loop = uncertain_tf([1.0], [1.0, k])
+    found = worst_case_gain(d * loop)
+    assert found.lower == np.inf and found.upper == np.inf and robust_stability(d * loop).upper == pytest.approx(0.5)
+
+
 def test_the_upper_bound_of_the_worst_case_gain_is_tight_with_real_and_repeated_blocks():
     """With too few steps along the path of scalings it was 4.6 times too large."""
     found = worst_case_gain(four_elements(8, 0.0))
@@ -133,6 +152,7 @@ def test_an_lft_with_blocks_is_the_same_as_the_system():
         (lambda: mixed_sensitivity(PLANT), "at least one weight"),
         (lambda: mixed_sensitivity(PLANT, np.ones((1, 2))), "expected 1 input"),
         (lambda: uncertainty_weight(PLANT, []), "expected responses"),
+        (lambda: uncertainty_weight(PLANT, [2 * PLANT], omega=[0.0]), "one of them positive"),
         (lambda: uncertainty_weight(PLANT, [PLANT]), "differ from a nominal one"),
         (lambda: uncertainty_weight(PLANT, [np.ones((2, 2))]), "responses of shape"),
         (lambda: uncertainty_weight(ROW, [2 * TWO_INPUTS], kind="output"), "additive or input"),
@@ -218,6 +238,21 @@ def test_a_weight_covers_every_response_and_not_much_more(kind):
     followed = error > 1e-4 * error.max()
     assert 20 * np.log10(np.max(size[followed] / error[followed])) <= 2.0 + 1e-6
     assert np.all(found.shape.poles().real < 0) and np.all(found.shape.zeros().real < 0)
+
+
+def test_a_weight_covers_the_error_at_zero_frequency():
+    omega = np.r_[0.0, np.geomspace(1, 100, 30)]
+    error = np.where(omega == 0, 1.0, 0.1)
+    found = uncertainty_weight(control.frd(np.ones(31), omega), control.frd(1 + error, omega))
+    np.testing.assert_array_equal(found.omega, omega)
+    assert np.all(found.magnitude(omega) >= error) and found.magnitude(np.zeros(1)) <= 10 ** (2 / 20)
+
+
+def test_a_weight_is_refused_for_a_system_that_no_stable_delta_makes():
+    """1/(s - 0.1) has the error of a stable system from 1/(s + 1), but is not in the set; its loop is unstable."""
+    nominal, other = tf([1.0], [1.0, 1.0]), tf([1.0], [1.0, -0.1])
+    with pytest.raises(InputError, match="expected 0 unstable poles"):
+        uncertainty_weight(nominal, [other])
 
 
 def test_a_weight_from_measured_responses_goes_into_dynamics():

@@ -38,8 +38,14 @@ def test_it_covers_the_data_within_one_dB_of_the_envelope_by_the_lowest_order(se
     wide = np.geomspace(weight.grid[0], weight.grid[-1], 500)
     if declared is not None:
         assert np.all(weight.envelope(wide) >= 1.2 * declared.magnitude(wide) * (1 - 1e-12))
-    assert 0 <= weight.slack_dB <= 1.0
+    # Everywhere, not only where it was fitted, the filter is above the envelope, by the stated amount at most.
+    ends = np.array([0.2, 5.0]) * weight.grid[[0, -1]]
+    between = np.geomspace(*ends, 30011)
+    excess = 20 * np.log10(weight.magnitude(between) / weight.envelope(between))
+    assert np.min(excess) >= -0.002 and np.max(excess) <= weight.slack_dB + 0.02
     curve = weight.envelope(weight.grid)
+    raised = weight.magnitude(weight.grid) / curve
+    assert 20 * np.log10(np.max(raised) / np.min(raised)) <= 1.0 + 1e-9  # the fit itself, at its frequencies
     lower = [covering_fit(weight.grid, curve, curve, order).error_max_dB for order in range(weight.shape.order)]
     assert all(excess > 1.0 for excess in lower)
     assert np.all(weight.shape.poles().real < 0) and np.all(weight.shape.zeros().real < 0)
@@ -95,7 +101,7 @@ def test_what_is_refused(changes, field):
 @pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, 1))])
 def test_the_steeper_envelope_is_taken_where_a_low_order_follows_it(seed):
     flat, found = IdentifiedSpread(OMEGA, bumpy(seed)), covering_spread(OMEGA, bumpy(seed))
-    assert found.slack_dB <= 1.0 and np.all(found.magnitude(OMEGA) >= found.data * (1 - 1e-9))
+    assert found.slack_dB <= 1.3 and np.all(found.magnitude(OMEGA) >= found.data * (1 - 1e-9))
     assert found.slope == 1.0 or (found.slope == 2.0 and found.shape.order <= 6)
     assert np.all(found.envelope(OMEGA) <= flat.envelope(OMEGA) * (1 + 1e-12))
 

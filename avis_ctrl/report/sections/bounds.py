@@ -54,13 +54,13 @@ def certificate(result: DesignResult) -> Paragraph:
     )
     reached = (
         f" The lower bound is attained: within {words.number(1 / mu.lower, 4)} times the declared uncertainty there is "
-        f"a plant whose weighted gain is {words.bound(mu.lower, 4)}."
+        f"a plant whose weighted gain is {words.lower(mu.lower, 4)}."
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
     )
     return Paragraph(
-        f"With the mu controller the peak of mu is between {words.bound(mu.lower, 4)} and "
-        f"{words.bound(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
+        f"With the mu controller the peak of mu is between {words.lower(mu.lower, 4)} and "
+        f"{words.upper(mu.upper, digits_apart(mu.upper, 1.0, 4))}, at {words.hertz(mu.omega)}"
         + (f", {words.number(gap, 2)} % apart" if np.isfinite(gap) else "")
         + f". If mu is below 1, every plant of the uncertainty set meets every weighted requirement. {between}{reached}"
     )
@@ -85,7 +85,7 @@ def _figure(name: str, result: DesignResult, bound_of: BoundOf, label: str, what
 def _stability(result: DesignResult) -> Table:
     def margin(c: ControllerResult) -> str:
         upper = c.stability.upper
-        return words.number(1 / upper) if c.stable and np.isfinite(upper) and upper > 0 else "none"
+        return words.lower(1 / upper) if c.stable and np.isfinite(upper) and upper > 0 else "none"
 
     return listed(
         "Robust stability. The margin is the factor by which the whole uncertainty set may grow before the "
@@ -93,8 +93,8 @@ def _stability(result: DesignResult) -> Table:
         result.controllers,
         {
             "controller": lambda c: c.title,
-            "mu upper": lambda c: words.bound(c.stability.upper, 4),
-            "mu lower": lambda c: words.bound(c.stability.lower, 4),
+            "mu upper": lambda c: words.upper(c.stability.upper, 4),
+            "mu lower": lambda c: words.lower(c.stability.lower, 4),
             "peak at": lambda c: words.hertz(c.stability.omega),
             "margin": margin,
             "stable for the set": stable_for_the_set,
@@ -107,7 +107,7 @@ def stable_for_the_set(c: ControllerResult) -> Mark:
     """Robust stability of the loop: yes, no, or not shown if the bounds of mu do not decide."""
     if not c.stable or c.stability.lower >= 1:
         return yes_or_no(False)
-    return yes_or_no(True) if c.stability.upper < 1 else Mark("not shown", False)
+    return yes_or_no(True) if c.stability.upper < 1 and c.stability.guaranteed else Mark("not shown", False)
 
 
 def _worst(result: DesignResult) -> Table:
@@ -116,9 +116,9 @@ def _worst(result: DesignResult) -> Table:
         case
         for c in tuned
         for case in (
-            (f"{c.title}: mu of the weighted performance", c.mu, words.bound(c.mu.lower, 4)),
-            (f"{c.title}: stability", c.stability, words.bound(c.stability.lower, 4)),
-            (f"{c.title}: peak transmissibility", c.worst_peak, words.decibel(c.worst_peak.lower)),
+            (f"{c.title}: mu of the weighted performance", c.mu, words.lower(c.mu.lower, 4)),
+            (f"{c.title}: stability", c.stability, words.lower(c.stability.lower, 4)),
+            (f"{c.title}: peak transmissibility", c.worst_peak, words.decibel(c.worst_peak.lower, "lower")),
         )
     ]
     return table(

@@ -25,7 +25,7 @@ def synthesis(result: DesignResult) -> Section:
             "step": lambda h: str(h.iteration),
             "kind": lambda h: h.kind,
             "gamma": lambda h: words.bound(h.gamma, 4),
-            "mu upper": lambda h: words.bound(h.mu_upper, 4),
+            "mu upper": lambda h: words.upper(h.mu_upper, 4),
             "order": lambda h: str(h.order),
             "order of D": lambda h: str(h.d_order),
             "fit error": lambda h: f"{words.number(100 * h.d_fit_error, 2)} %",

@@ -31,9 +31,9 @@ def _against_skyhook(result: DesignResult) -> Table:
         result.by_axis,
         {
             "axis": lambda one: words.axis(one.axis),
-            "mu synthesis, at most": lambda one: words.decibel(one.mu),
-            "skyhook, at least": lambda one: words.decibel(one.skyhook),
-            "improvement, at least": lambda one: words.decibel(one.advantage),
+            "mu synthesis, at most": lambda one: words.decibel(one.mu, "upper"),
+            "skyhook, at least": lambda one: words.decibel(one.skyhook, "lower"),
+            "improvement, at least": lambda one: words.decibel(one.advantage, "lower"),
         },
         "lrrr",
     )
@@ -107,20 +107,22 @@ def _nominal(result: DesignResult) -> Figure:
 
 def _uncertain(result: DesignResult) -> Figure:
     """The mu controller, and the tuned controllers "skyhook" and "loops" if they were computed."""
-    panels, peaks = [], []
+    panels, peaks, guaranteed = [], [], True
     for c in (c for name in ("mu", "skyhook", "loops") for c in result.controllers if c.name == name):
         T, worst = c.transmissibility, upper_bound(c, "upper bound over the whole set")
         label = f"{c.title}: range over sampled plants"
         band = Band(_hz(c), in_dB(T.low), in_dB(T.high), label, controller_style(c.name))
         panels.append(_panel([_sigma(c), worst, target(result)], [band], c.title))
+        guaranteed = guaranteed and c.worst_peak.guaranteed
         peaks.append(
             f"{c.title}: sampled plants peak at {words.decibel(float(np.max(T.high)))}, the "
-            f"bound at {words.decibel(c.worst_peak.upper)}"
+            f"bound at {words.decibel(c.worst_peak.upper, 'upper')}"
         )
+    proved = "; the bound of the peak is also proved between them" if guaranteed else ""
     caption = (
         "Largest singular value over the uncertainty set: nominal (line), range over the sampled plants (area), "
         f"and the upper bound that no plant of the set exceeds at the marked frequencies. The lines between the "
-        f"marks only guide the eye; the bound of the peak is also proved between them. {'; '.join(peaks)}."
+        f"marks only guide the eye{proved}. {'; '.join(peaks)}."
     )
     return Figure("transmissibility_uncertain", caption, panels, len(panels))
 

@@ -66,7 +66,7 @@ def _achieved(result: DesignResult) -> str:
     if mu.stable and mu.stability.lower >= 1:
         return (
             f"With the mu controller, the loop is unstable for a plant of the uncertainty set: mu of the uncertainty "
-            f"alone is at least {words.bound(mu.stability.lower)}. So there is no worst-case transmissibility."
+            f"alone is at least {words.lower(mu.stability.lower)}. So there is no worst-case transmissibility."
         )
     if not np.isfinite(mu.worst_peak.upper):
         return (
@@ -76,8 +76,9 @@ def _achieved(result: DesignResult) -> str:
     sure = "" if mu.worst_peak.guaranteed and mu.worst_band.guaranteed else " at the computed frequencies"
     return (
         f"For every plant of the uncertainty set the mu controller keeps the transmissibility at or below "
-        f"{words.decibel(mu.worst_peak.upper)} at any frequency and {words.decibel(mu.worst_band.upper)} from "
-        f"{low:g} to {high:g} Hz{sure}; without control the table amplifies by "
+        f"{words.decibel(mu.worst_peak.upper, 'upper')} at any frequency and "
+        f"{words.decibel(mu.worst_band.upper, 'upper')} from {low:g} to {high:g} Hz{sure}; without control the table "
+        "amplifies by "
         f"{words.decibel(result.controller('passive').peak_transmissibility)} at its resonance. {all_axes(result)}"
     )
 
@@ -90,14 +91,14 @@ def comparison(result: DesignResult) -> Section:
         ("order", lambda c: str(c.order)),
         ("gamma, nominal weighted loop", lambda c: words.bound(c.gamma)),
         ("the same by SLICOT's AB13DD", lambda c: "failed" if c.gamma_slicot is None else words.bound(c.gamma_slicot)),
-        ("mu, upper bound", lambda c: words.bound(c.mu.upper, 4)),
-        ("mu, lower bound", lambda c: words.bound(c.mu.lower, 4)),
+        ("mu, upper bound", lambda c: words.upper(c.mu.upper, 4)),
+        ("mu, lower bound", lambda c: words.lower(c.mu.lower, 4)),
         ("mu peaks at", lambda c: words.hertz(c.mu.omega)),
         ("stable, nominal", lambda c: yes_or_no(c.stable)),
         ("stable for the whole set", stable_for_the_set),
         ("peak transmissibility, nominal", lambda c: _settled(c, words.decibel(c.peak_transmissibility))),
-        ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper)),
-        (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper)),
+        ("peak transmissibility, worst case", lambda c: words.decibel(c.worst_peak.upper, "upper")),
+        (f"worst case over {low:g} to {high:g} Hz", lambda c: words.decibel(c.worst_band.upper, "upper")),
         (
             f"payload velocity r.m.s., {start:g} to {stop:g} Hz, worst axis",
             lambda c: _settled(c, _micro(c.site.velocity_rms)),
