@@ -44,7 +44,7 @@ def rounded_down(value: float, digits: int) -> float:
 def _directed(value: float, digits: int, rounding: str) -> float:
     if not isfinite(value) or value == 0:
         return value
-    exact = Decimal(float(value))
+    exact = Decimal(repr(float(value)))  # the shortest number that reads back as this one
     return float(exact.quantize(Decimal(1).scaleb(exact.adjusted() - digits + 1), rounding=rounding))
 
 

@@ -33,6 +33,7 @@ CERTIFICATE_KEYS = {
     "mu_upper",
     "mu_lower",
     "guaranteed",
+    "assumptions",
     "stable",
     "worst_case_peak_transmissibility_dB",
     "worst_case_band_transmissibility_dB",

@@ -168,7 +168,7 @@ def history():
 
 def test_mu_says_what_its_bound_is_worth():
     ax = plot.mu(peak())
-    assert "peak at most 0.9101, proved between all points" in words(ax)
+    assert "peak at most 0.91, proved between all points" in words(ax)
     f, upper = curve(ax)
     np.testing.assert_allclose(f, np.array([1.0, 10.0]) / (2 * np.pi))  # zero has no place on a logarithmic axis
     np.testing.assert_allclose(upper, [0.905, 0.2])
