@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -57,7 +58,7 @@ def render(document: Document) -> bytes:
     folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
     fonts = typst.Fonts(include_system_fonts=False, include_embedded_fonts=True, font_paths=[str(folder)])
     try:
-        made = typst.compile(
+        made, complaints = typst.compile_with_warnings(
             template,
             format="pdf",
             font_paths=fonts,
@@ -69,6 +70,9 @@ def render(document: Document) -> bytes:
         raise ComputationError(
             "the PDF report was not typeset", cause=str(error), next_step="the HTML report has the same content"
         ) from error
+    # Page numbers and places of figures are not reliable if the layout did not converge.
+    for one in complaints:
+        warnings.warn(f"layout of the PDF report: {one.message}", stacklevel=2)
     assert isinstance(made, bytes)  # one PDF for any number of pages
     return made
 

@@ -93,6 +93,12 @@ def test_the_first_page_is_read_alone(name, report, tmp_path) -> None:
     assert [s.alone for s in report.document.sections[:3]] == [True, False, False]
 
 
+def test_the_pages_are_numbered(name, report, tmp_path) -> None:
+    pages = pdf_text(report.pdf, tmp_path).split("\f")[:-1]
+    numbers = [re.findall(r"^ *(\d+) ?/ ?(\d+)$", page.rstrip(), re.M)[-1] for page in pages]
+    assert numbers == [(str(k), str(len(pages))) for k in range(1, len(pages) + 1)]
+
+
 def test_html_fetches_nothing_and_stays_small(name, report) -> None:
     page = Reader(report.html)
     for tag, attributes in page.elements:
