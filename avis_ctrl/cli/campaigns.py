@@ -97,7 +97,7 @@ def excite(
 SIMULATE_CAMPAIGN = Options("""
 --out CAMPAIGN.h5: file to write
 --plan PLAN.toml: records, levels, floor; by default multisines at three levels, noise, rest and a shaken floor
---write-plan FILE: also write the plan used, as a starting point
+--write-plan FILE: write the plan used, as a starting point; without --out nothing is simulated
 --truth FILE: also write the rig that was simulated, with its perturbed values
 --perturbed: default plan; stiffness, mass and inertia differ from the rig file by up to 5 %, damping by up to 20 %, and
     values with a tolerance in the rig file by random amounts (normal, the tolerance is the standard deviation)
@@ -111,7 +111,7 @@ SIMULATE_CAMPAIGN = Options("""
 
 def simulate_campaign(
     rig: RIG,
-    out: Annotated[Path, SIMULATE_CAMPAIGN("--out")],
+    out: Annotated[Path | None, SIMULATE_CAMPAIGN("--out")] = None,
     plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--plan")] = None,
     write_plan: Annotated[Path | None, SIMULATE_CAMPAIGN("--write-plan")] = None,
     truth: Annotated[Path | None, SIMULATE_CAMPAIGN("--truth")] = None,
@@ -151,6 +151,13 @@ def simulate_campaign(
         if plan
         else default_plan(table, "orthogonal" if orthogonal else "zippered", perturbed=perturbed, duration_s=duration_s)
     )
+    if write_plan is not None and not plan:
+        write_whole(write_plan, plan_toml(chosen).encode())
+    if out is None:
+        if write_plan is None or truth is not None:
+            raise InputError("expected a file for the campaign", field="--out")
+        terminal.print(f"{write_plan}: plan of a campaign, to edit; simulate it with --plan {write_plan} --out FILE.h5")
+        return
     with Progress(terminal) as progress:
         try:
             simulated = campaign_with_effects(

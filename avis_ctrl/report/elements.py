@@ -88,15 +88,17 @@ class Table:
         return isinstance(cell, str) and len(cell) > SETTINGS.cell_letters
 
     @property
-    def key(self) -> int:
-        """Column that distinguishes the rows best, the heading of such a block: short text, the first of equal ones."""
+    def keys(self) -> tuple[int, ...]:
+        """Columns that head such a block: the first and, if it repeats, the one of short text that differs most."""
         columns = list(zip(*self.rows, strict=True))
         short = [
             k
             for k, cells in enumerate(columns)
             if self.alignment(k) == "l" and all(isinstance(c, str) and not self.wraps(c) for c in cells)
         ]
-        return max(short, key=lambda k: len(set(columns[k])), default=0)
+        different = [len({str(cell) for cell in cells}) for cells in columns]
+        other = max(short, key=lambda k: different[k], default=0)
+        return (0,) if not columns or different[other] <= different[0] else (0, other)
 
 
 @dataclass(frozen=True)

@@ -259,10 +259,10 @@ def _structures(
     n_w, n_z = P.ninputs - ncon - uncertainty.n_w, P.noutputs - nmeas - uncertainty.n_z
     if n_w < 1 or n_z < 1:
         raise InputError(
-            f"blocks take {uncertainty.n_w} inputs and {uncertainty.n_z} outputs of a plant with "
-            f"{P.ninputs - ncon} inputs (w_delta, w) and {P.noutputs - nmeas} outputs (z_delta, z); "
-            "at least one of each must be left for performance",
-            field="blocks",
+            "expected at least one input and one output for performance: besides those of the controller, the plant "
+            f"has {P.ninputs - ncon} inputs and {P.noutputs - nmeas} outputs, of which the blocks take "
+            f"{uncertainty.n_w} and {uncertainty.n_z}",
+            field="P",
         )
     full = uncertainty.with_performance(n_w, n_z)
     return full, full.simplified() if full.many else full.complexified()

@@ -174,8 +174,8 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
         return below_one(_rows(plant, name), factor)
 
     text = (
-        f"It follows from mu that this controller meets it with every uncertainty divided by {_up(mu.mu.upper, 4):g} "
-        f"and every bound relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
+        f"This controller meets the specification if every uncertainty is divided by {_up(mu.mu.upper, 4):g} (which "
+        f"follows from mu) and every bound is relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
     )
     if not M.size:
         return text

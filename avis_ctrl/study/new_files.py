@@ -96,12 +96,13 @@ def rig_text(new: NewRig) -> str:
             f"stiffness_N_per_m = {_row(k)}   # from {new.horizontal_Hz:g} Hz along x and y, "
             f"{new.vertical_Hz:g} Hz along z\ndamping_Ns_per_m = {_row(c)}    # damping ratio {new.damping:g}\n"
         )
-    text += f"\n[actuators]\nlimit_V = {new.limit_V:g}\n"
+    text += f"\n[actuators]\nlimit_V = {new.limit_V:g}{_if_default(new, 'limit_V')}\n"
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
         for letter, direction in (("z", (0, 0, 1)), axis):
             text += (
                 f'\n[[drive]]\nname = "A{letter}{n}"\nposition_m = {_row(place)}      # assumed: at the mount\n'
-                f"direction = {_row(direction)}      # assumed\nconstant_N_per_V = {new.constant_N_per_V:g}\n"
+                f"direction = {_row(direction)}      # assumed\nconstant_N_per_V = {new.constant_N_per_V:g}"
+                f"{_if_default(new, 'constant_N_per_V')}\n"
             )
     sensor = _ACCELEROMETER if new.sensors == "accelerometer" else _geophone(new.geophone)
     for n, (place, axis) in enumerate(zip(places, _horizontal(new), strict=True), 1):
@@ -122,6 +123,12 @@ def rig_text(new: NewRig) -> str:
         + "\n# If there is an analogue anti-alias filter (Butterworth) before the converter:\n"
         f"# [electronics]\n# anti_alias_order = 4\n# anti_alias_corner_Hz = {new.sample_rate_Hz / 4:g}\n"
     )
+
+
+def _if_default(new: NewRig, name: str) -> str:
+    """A mark of a value that is the default of `NewRig`."""
+    default = next(one.default for one in fields(NewRig) if one.name == name)
+    return "      # assumed, unless you entered it" if getattr(new, name) == default else ""
 
 
 def rig_of(new: NewRig) -> Rig:

@@ -114,9 +114,10 @@ def distance(decades: np.ndarray) -> float:
 def records_fit(
     measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
 ) -> tuple[Finding, ...]:
-    """`check_records`; with `despite`, its error is only reported as a line of progress."""
+    """`check_records`; with `despite`, its error is only reported as a line of progress. Errors of reading are not."""
+    seen = record_spectra(measured)
     try:
-        return check_records(measured, model)
+        return _checked(measured, model, seen)
     except InputError as error:
         if not despite:
             raise InputError(
@@ -133,7 +134,10 @@ def check_records(measured: Campaign, model: ResponseModel) -> tuple[Finding, ..
 
     Raises InputError: one line that names the field and the likely error.
     """
-    seen = record_spectra(measured)
+    return _checked(measured, model, record_spectra(measured))
+
+
+def _checked(measured: Campaign, model: ResponseModel, seen: RecordSpectra | None) -> tuple[Finding, ...]:
     if seen is None:
         return ()
     errors = UnitErrors(measured, model, seen)
@@ -348,7 +352,7 @@ class UnitErrors:
         ]
         options.sort(key=lambda one: one[0])
         prefix = {1e3: ("m", "k"), 1e-3: ("k", "m")}.get(factor)
-        records = f"are the records' y in {prefix[0]}{unit} or u in {prefix[1]}V?" if prefix else ""
+        records = f"is y in {prefix[0]}{unit}, or u in {prefix[1]}V, whatever unit the file states?" if prefix else ""
         if options and options[0][0] < -0.2:
             _, field, value = options[0]
             return field, value, f"did you mean {value * factor:g}{', or ' if records else '?'}{records}"

@@ -124,12 +124,11 @@ def tuned_skyhook(
             next_step="change the corners in [skyhook], or use sensors with a lower corner",
         )
     low, high = evaluation.band_Hz
-    notes = [
-        in_words(loops),
+    aim = (
         f"tuned for the smallest worst-case transmissibility from {low:g} to {high:g} Hz with a worst-case peak of at "
-        f"most {decibels(peak_limit):+.2f} dB, not for mu; the drive voltage is not limited",
-        *at_limits(loops, task.search),
-    ]
+        f"most {decibels(peak_limit):+.2f} dB, not for mu; the drive voltage is not limited"
+    )
+    notes = [in_words(loops), *([aim] if best.meets else []), *at_limits(loops, task.search)]
     if loops is classical:
         notes.append("this is critical damping with the usual corners: none of the other tunings tried is better")
     if not best.meets:
@@ -138,7 +137,10 @@ def tuned_skyhook(
             if np.isfinite(best.peak)
             else "none is proved stable for the whole uncertainty set"
         )
-        notes.append(f"no skyhook tuning found has a worst-case peak below {decibels(peak_limit):+.2f} dB: {reached}")
+        notes.append(
+            f"no skyhook tuning found has a worst-case peak below {decibels(peak_limit):+.2f} dB: {reached} (tuned for "
+            "this peak, not for mu; the drive voltage is not limited)"
+        )
     return Candidate("skyhook", "skyhook, tuned", "skyhook", loops.controller(), tuple(notes))
 
 

@@ -163,7 +163,8 @@ def all_axes(result: DesignResult) -> str:
         for value, bound, where in ((peak, mu.worst_peak, "at the peak"), (band, mu.worst_band, inside_band))
         if np.isfinite(bound.upper) and value > decibels(bound.upper)
     ]
-    locked = f"The worst-case bounds hold for {joined(result.design.keep)} with the other coordinates locked"
+    others = "" if len(result.design.keep) == len(COORDINATES) else " with the other coordinates locked"
+    locked = f"The worst-case bounds hold for {joined(result.design.keep)}{others}"
     reached = (
         "With all six degrees of freedom the transmissibility of the nominal sampled loop is at most "
         f"{peak:+.1f} dB, and at most {band:+.1f} dB {inside_band}"

@@ -71,11 +71,11 @@ def test_the_heading_of_a_folded_row_distinguishes_it() -> None:
     """By the parameter where all rows have the same effect; never by long text, and by the first column otherwise."""
     long = "a sentence that is longer than the line of a phone can be"
     rows = [("lag", "actuators", f"uneven_{k}", "0.1", long) for k in range(3)]
-    assert table("", ("effect", "place", "parameter", "value", "meaning"), rows, "lllrl").key == 2
+    assert table("", ("effect", "place", "parameter", "value", "meaning"), rows, "lllrl").keys == (0, 2)
     gates = table("", ("gate", "finding", "severity"), [("hum", long, "note"), ("spikes", long, "ok")], "llc")
-    assert gates.key == 0 and gates.folds
+    assert gates.keys == (0,) and gates.folds
     assert not table("", ("what", "value"), [("seed", long)]).folds
-    assert table("", ("a", "b", "c", "d"), [], "llll").key == 0
+    assert table("", ("a", "b", "c", "d"), [], "llll").keys == (0,)
 
 
 def test_curves_reach_the_page_unchanged(fabricated: DesignResult, html: bytes) -> None:

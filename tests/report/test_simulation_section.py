@@ -64,7 +64,7 @@ def test_caption_states_the_frequencies_of_the_velocity_and_one_limit_once(simul
     table = next(p for p in simulation(simulated).pieces if isinstance(p, Table) and "Every" in p.caption)
     assert "Commanded voltages, limit 10.0 V;" in table.caption and table.rows[0][4] == "0 V"
     half_rate = simulated.rig.sample_rate_Hz / 2
-    assert f"The velocity contains all frequencies up to {half_rate:.0f} Hz" in table.caption
+    assert f"The velocity contains all frequencies from 0 to {half_rate:.0f} Hz" in table.caption
 
 
 def test_each_axis_is_weighed_against_the_drive_that_reaches_its_limit_first(limited: DesignResult) -> None:

@@ -128,8 +128,8 @@ def test_sensors_that_are_off_by_different_factors_are_told_apart(sound):
             lambda m: changed(m, u=1e3),
             r"^u of the records = .*limit of drive A\w+ is 10 V: did you mean .*\(given in mV\)",
         ),
-        (lambda m: changed(m, u=1e-3), "all channels differ by the same factor: are the records' y in mV or u in kV"),
-        (lambda m: changed(m, y=1e-3), "all channels differ by the same factor: are the records' y in kV or u in mV"),
+        (lambda m: changed(m, u=1e-3), "all channels differ by the same factor: is y in mV, or u in kV"),
+        (lambda m: changed(m, y=1e-3), "all channels differ by the same factor: is y in kV, or u in mV"),
         (
             lambda m: changed(m, y=only(len(m.y_names), 2, 1e3)),
             "sensitivity of (Sx2|acc_A3) = .*only (Sx2|acc_A3) differs",

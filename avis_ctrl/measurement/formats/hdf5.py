@@ -170,6 +170,8 @@ def _part(dataset: Any, role: str) -> Part:
     if shape is None or len(shape) not in (1, 2):
         raise InputError("expected shape (samples, channels)", field=role, value=shape)
     samples, count = shape[0], shape[1] if len(shape) == 2 else 1
+    if samples == 0:
+        raise InputError("expected samples; the record is empty", field=role, value=shape)
     if count > samples:
         message = (
             f"expected (samples, channels) with more samples than channels; {samples} samples of {count} channels look "

@@ -182,10 +182,10 @@ class LocalFit:
         """
         if self.dof < 1 or self._unit is None:
             message = (
-                f"expected a wider window or more records: {self.dof} degrees of freedom remain on each line with "
-                f"{self.n_u} inputs, order {self.order}, {self.records} records"
+                f"expected more or longer records, or a wider window: {self.dof} degrees of freedom remain on each "
+                f"line with {self.n_u} inputs, order {self.order} and {self.half_width} lines on each side"
             )
-            raise InputError(message, field="half_width", value=self.half_width)
+            raise InputError(message, field="records", value=self.records)
         lead, first = self._lead, self._lead + self.n_u
         slopes, own, outputs = self._factor[:, :, :lead], self._factor[:, :, lead:first], self._factor[:, :, first:]
         # Size of each input in the window, at least that of a silent input.

@@ -53,8 +53,8 @@ def certificate(result: DesignResult) -> Paragraph:
         "guaranteed, although the grid was refined near every local peak."
     )
     reached = (
-        f" The lower bound is attained: within {words.number(1 / mu.lower, 4)} times the declared uncertainty there is "
-        f"a plant whose weighted gain is {words.lower(mu.lower, 4)}."
+        f" The lower bound is attained: with uncertainties {words.number(1 / mu.lower, 4)} times as large as declared, "
+        f"there is a plant whose weighted gain is {words.lower(mu.lower, 4)}."
         if np.isfinite(mu.lower) and mu.lower > 0
         else ""
     )

@@ -46,9 +46,9 @@ def _plants(check: SimulationCheck) -> Table:
     nearest = "of the drive that comes closest to its limit;" if differ else "limit"
     return listed(
         f"Every simulated plant. Commanded voltages, {nearest} {words.limits(limits)}; clipped samples of "
-        "drives and converter together. The velocity contains all frequencies up to "
-        f"{words.number(loop.rig.sample_rate_Hz / 2)} Hz, unlike the comparison of controllers, which is for the band "
-        "of the floor only.",
+        "drives and converter together. The voltages include the offset of the electronics. The velocity contains all "
+        f"frequencies from 0 to {words.number(loop.rig.sample_rate_Hz / 2)} Hz, with the slow motion below the band of "
+        "the floor, to which the comparison of controllers is limited.",
         check.plants,
         {
             "plant": lambda p: p.name,

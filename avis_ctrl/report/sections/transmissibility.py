@@ -64,10 +64,14 @@ def _sigma(c: ControllerResult) -> Curve:
 
 
 def upper_bound(c: ControllerResult, label: str) -> Curve:
-    """Upper bound of the worst case, marked at the computed frequencies; between them it may be higher."""
-    b = c.worst_peak
-    order = np.argsort(b.frequencies)
-    return Curve(b.frequencies[order] / (2 * np.pi), in_dB(b.upper_curve[order]), label, STYLES["plain"], points=True)
+    """Upper bound of the worst case, marked at the computed frequencies, with those of the band and its edges; between
+    them it may be higher."""
+    frequencies, upper = (
+        np.concatenate([getattr(c.worst_peak, name), getattr(c.worst_band, name)])
+        for name in ("frequencies", "upper_curve")
+    )
+    f, first = np.unique(frequencies, return_index=True)
+    return Curve(f / (2 * np.pi), in_dB(upper[first]), label, STYLES["plain"], points=True)
 
 
 def _hz(c: ControllerResult) -> np.ndarray:
