@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,18 @@ import numpy as np
 from avis_ctrl.errors import InputError
 
 HERTZ = 2 * np.pi
+
+
+@dataclass(frozen=True)
+class LegendSettings:
+    """label : longest label [characters] with which a legend above the axes has two columns; two longer ones are wider
+    than a figure of 6.4 inches.
+    """
+
+    label: int = 38
+
+
+SETTINGS = LegendSettings()
 
 
 def axes_of(given: Any, rows: int = 1) -> Any:
@@ -47,8 +60,9 @@ def finish(ax: Any, x: str, y: str, log: bool = True, above: bool = False) -> An
     ax.set_ylabel(y)
     ax.grid(True, which="major", linewidth=0.5, color="#d8d8d8")
     ax.set_axisbelow(True)
-    if ax.get_legend_handles_labels()[0]:
-        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 2} if above else {}
+    if labels := ax.get_legend_handles_labels()[1]:
+        columns = 2 if max(map(len, labels)) <= SETTINGS.label else 1
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": columns} if above else {}
         ax.legend(fontsize="small", framealpha=0.85, edgecolor="none", **place)
     return ax
 

@@ -138,6 +138,8 @@ def order(history: Any, ax: Any = None) -> Any:
         if isinstance(history, (list, tuple)) and history and isinstance(history[0], tuple)
         else [(row.order, row.mu_upper) for row in _rows(history)]
     )
+    if hasattr(history, "K") and hasattr(history, "mu_upper"):  # of a given order, it is not in the history
+        rows = [*rows, (history.K.nstates, history.mu_upper)]
     states, values = (np.array(part, float) for part in zip(*sorted(rows), strict=True))
     ax.plot(states, values, "o", color=COLOURS["mu"], markersize=4, label="controllers")
     look = {"where": "post", "color": COLOURS["mu"], "linewidth": 1}

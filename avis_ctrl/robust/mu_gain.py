@@ -11,6 +11,7 @@ sign of Re(x^H a) (real scalar). The performance block absorbs every phase, so t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -97,6 +98,18 @@ def worst_gain(
     _take_dyads(repeated, delta, gain, structure)
     best = np.argmax(gain.reshape(count, batch), axis=0) * batch + np.arange(batch)
     return WorstGain(gain[best], delta[best])
+
+
+def with_neighbours(M: Array, found: WorstGain) -> WorstGain:
+    """The gains with the perturbation of a neighbouring frequency where that is worse: an ascent can end at a lower
+    maximum at one frequency only. M (B, ..) at increasing frequencies."""
+    gain, delta = found.gain.copy(), found.delta.copy()
+    for order in (np.arange(len(M)), np.arange(len(M))[::-1]):
+        for before, k in pairwise(order):
+            value = _gain(M[[k]], delta[[before]])[0]
+            if np.isfinite(value) and value > gain[k]:
+                gain[k], delta[k] = value, delta[before]
+    return WorstGain(gain, delta)
 
 
 def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockStructure) -> None:

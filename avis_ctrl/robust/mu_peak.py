@@ -23,7 +23,7 @@ from avis_ctrl.lti.bilinear import continuous_image, image_frequency, sampled_fr
 from avis_ctrl.lti.interchange import as_system
 from avis_ctrl.robust.mu_coupled import Coupled, coupled
 from avis_ctrl.robust.mu_cover import Cover, Interval, accuracy_of, distance_to_singular
-from avis_ctrl.robust.mu_gain import WorstGain, worst_gain
+from avis_ctrl.robust.mu_gain import WorstGain, with_neighbours, worst_gain
 from avis_ctrl.robust.mu_lmi import Array, joined, selected
 from avis_ctrl.robust.mu_lower import SETTINGS as LOWER
 from avis_ctrl.robust.mu_lower import MuLowerBound, lower_bound, singular_frequency
@@ -393,6 +393,7 @@ def _worst_case_gain(
 
     # Lower bounds are cheap and tight: they show where upper bounds are worth computing.
     searched, reached = _searched(N, band, slack, lambda M: worst_gain(M, structure))
+    reached = with_neighbours(N.frequency_response(searched), reached)
     kept = _thinned(reached.gain, points)
     omega = searched[kept]
     upper = bound(N.frequency_response(omega)[:, None])
