@@ -29,7 +29,7 @@ class GainSettings:
     dyad_loss : relative loss of gain that is accepted to replace a full block by a dyad (matrix of rank one).
     """
 
-    steps: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05)
+    steps: tuple[float, ...] = (1.0, 0.5, 0.2, 0.05, 0.01, 0.002)
     accuracy: float = 1e-6
     dyad_loss: float = 1e-4
 
@@ -60,15 +60,23 @@ def _gain(M: Array, delta: Array) -> Array:
         return np.array([np.inf]) if len(M) == 1 else np.concatenate([_gain(M[[k]], delta[[k]]) for k in range(len(M))])
 
 
-def _steepest(M: Array, delta: Array, structure: BlockStructure) -> Array:
-    """The Delta of norm 1 that raises the largest singular value most, to first order."""
+def _steepest(M: Array, delta: Array, structure: BlockStructure) -> tuple[Array, Array]:
+    """The Delta (B, n_w, n_z) of norm 1 that raises the largest singular value most, to first order, and Delta with
+    only the block changed that contributes most to this."""
     n_w, n_z = structure.n_w, structure.n_z
     U, _, Vh = np.linalg.svd(perturbed(M, delta))
     u, v = U[:, :, 0], np.conj(Vh[:, 0])
     M11, M12, M21 = M[:, :n_z, :n_w], M[:, :n_z, n_w:], M[:, n_z:, :n_w]
     x = np.linalg.solve(np.eye(n_z) - M11 @ delta, M12 @ v[..., None])[..., 0]
     a = np.linalg.solve(dagger(np.eye(n_w) - delta @ M11), dagger(M21) @ u[..., None])[..., 0]
-    return aligned(a, x, structure, lambda product, _: np.where(product >= 0, 1.0, -1.0))
+    steepest = aligned(a, x, structure, lambda product, _: np.where(product >= 0, 1.0, -1.0))
+    change, places = steepest - delta, list(structure.slices())
+    rise = np.array([np.einsum("bi,bij,bj->b", np.conj(a[:, w]), change[:, w, z], x[:, z]).real for _, w, z in places])
+    one = delta.copy()
+    for k, (_, w, z) in enumerate(places):
+        most = np.argmax(rise, axis=0) == k
+        one[most, w, z] = steepest[most, w, z]
+    return steepest, one
 
 
 def worst_gain(
@@ -88,20 +96,14 @@ def worst_gain(
         delta[k] = structure.random(rng)
     repeated = np.concatenate([M] * count)
     gain = _gain(repeated, delta)
-    climbing = np.flatnonzero(np.isfinite(gain))
-    for _ in range(iterations):
-        gained = gain[climbing]
-        _climb(repeated, delta, gain, climbing, structure)
-        climbing = climbing[(gain[climbing] > gained * (1 + SETTINGS.accuracy)) & np.isfinite(gain[climbing])]
-        if not climbing.size:
-            break
+    _ascend(repeated, delta, gain, np.flatnonzero(np.isfinite(gain)), structure, iterations)
     _take_dyads(repeated, delta, gain, structure)
     best = np.argmax(gain.reshape(count, batch), axis=0) * batch + np.arange(batch)
     return WorstGain(gain[best], delta[best])
 
 
-def with_neighbours(M: Array, found: WorstGain) -> WorstGain:
-    """The gains with the perturbation of a neighbouring frequency where that is worse: an ascent can end at a lower
+def with_neighbours(M: Array, found: WorstGain, structure: BlockStructure, iterations: int = 20) -> WorstGain:
+    """Ascent from the perturbation of a neighbouring frequency where its gain is larger: an ascent can end at a lower
     maximum at one frequency only. M (B, ..) at increasing frequencies."""
     gain, delta = found.gain.copy(), found.delta.copy()
     for order in (np.arange(len(M)), np.arange(len(M))[::-1]):
@@ -109,25 +111,41 @@ def with_neighbours(M: Array, found: WorstGain) -> WorstGain:
             value = _gain(M[[k]], delta[[before]])[0]
             if np.isfinite(value) and value > gain[k]:
                 gain[k], delta[k] = value, delta[before]
+    changed = np.flatnonzero(np.isfinite(gain) & (gain > found.gain))
+    if changed.size:
+        _ascend(M, delta, gain, changed, structure, iterations)
+        _take_dyads(M, delta, gain, structure)
     return WorstGain(gain, delta)
 
 
+def _ascend(M: Array, delta: Array, gain: Array, climbing: Array, structure: BlockStructure, iterations: int) -> None:
+    """Steps of the problems `climbing`, in place, until none raises the gain."""
+    for _ in range(iterations):
+        gained = gain[climbing]
+        _climb(M, delta, gain, climbing, structure)
+        climbing = climbing[(gain[climbing] > gained * (1 + SETTINGS.accuracy)) & np.isfinite(gain[climbing])]
+        if not climbing.size:
+            break
+
+
 def _climb(M: Array, delta: Array, gain: Array, which: Array, structure: BlockStructure) -> None:
-    """One step of the problems `which`, in place, with the first step length that raises the gain."""
-    direction = _steepest(M[which], delta[which], structure) - delta[which]
-    for step in SETTINGS.steps:
-        trial = delta[which] + step * direction
-        value = _gain(M[which], trial)
-        better = value > gain[which]
-        delta[which[better]], gain[which[better]] = trial[better], value[better]
-        which, direction = which[~better], direction[~better]
+    """One step of the problems `which`, in place, with the first step length that raises the gain: of all blocks, or
+    else of one, because another one may be at a narrow maximum."""
+    targets = np.stack(_steepest(M[which], delta[which], structure))
+    for kind in range(len(targets)):
+        for step in SETTINGS.steps:
+            trial = delta[which] + step * (targets[kind] - delta[which])
+            value = _gain(M[which], trial)
+            better = value > gain[which]
+            delta[which[better]], gain[which[better]] = trial[better], value[better]
+            which, targets = which[~better], targets[:, ~better]
 
 
 def _take_dyads(M: Array, delta: Array, gain: Array, structure: BlockStructure) -> None:
     """Replace full blocks by dyads of the gradient, which they are at a maximum: only dyads can be realised with
     constant norm. In place, if the gain decreases by at most `dyad_loss`."""
     finite, dyads = np.isfinite(gain), delta.copy()
-    steepest = _steepest(M[finite], delta[finite], structure)
+    steepest, _ = _steepest(M[finite], delta[finite], structure)
     for block, w, z in structure.slices():
         if block.kind == "full":
             dyads[finite, w, z] = steepest[:, w, z]

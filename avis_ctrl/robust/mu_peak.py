@@ -393,7 +393,7 @@ def _worst_case_gain(
 
     # Lower bounds are cheap and tight: they show where upper bounds are worth computing.
     searched, reached = _searched(N, band, slack, lambda M: worst_gain(M, structure))
-    reached = with_neighbours(N.frequency_response(searched), reached)
+    reached = with_neighbours(N.frequency_response(searched), reached, structure)
     kept = _thinned(reached.gain, points)
     omega = searched[kept]
     upper = bound(N.frequency_response(omega)[:, None])

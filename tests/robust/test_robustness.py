@@ -107,8 +107,8 @@ def test_the_worst_case_gain_near_a_resonance(band):
     stiffness, omega = np.linspace(80, 120, 41)[:, None], np.sqrt(80) + np.linspace(-0.05, 0.05, 20001)
     exact = np.max(np.abs((1j * omega + 1) / (-(omega**2) + 0.06j * omega + stiffness)))
     assert exact * (1 - 1e-3) <= found.lower <= exact * (1 + 1e-6) <= found.upper * (1 + 1e-6) <= exact * (1 + 2e-3)
-    # An ascent that ends at a lower maximum has better neighbours.
-    assert np.all(found.lower_curve >= (0.98 if np.isinf(band[1]) else 0.75) * found.upper_curve)
+    # The maximum is narrow in k, whose ascent must not stop that in c.
+    assert np.all(found.lower_curve >= 0.99 * found.upper_curve)
 
 
 def test_a_block_that_only_performance_closes_does_not_hide_an_instability():
