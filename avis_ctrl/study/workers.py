@@ -110,9 +110,9 @@ class Workers:
         if self._pool is None:
             return
         if kind is not None:
-            # The results are no longer needed; without this the interpreter would wait for them before it exits. A child
-            # that has just started still has this process's handler of SIGTERM, and would then wait for a queue that a
-            # dead one has locked.
+            # The results are no longer needed; without this the interpreter would wait for them before it exits. Not by
+            # SIGTERM: a child that has just started has this process's handler of it, and would then wait for a queue
+            # that a dead one has locked.
             for child in set(multiprocessing.active_children()) - self._others:
                 child.kill()
         self._pool.shutdown(cancel_futures=True)
