@@ -36,7 +36,7 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     --------
     >>> loop = (ac.real("k", 1.0, percent=20) * ac.tf([25.0], [1.0, 10.0, 10.0, 10.0])).feedback()
     >>> [text.get_text() for text in ac.plot.mu(ac.robust_stability(loop)).get_legend().get_texts()][-1]
-    'reached: 0.1429 at 0 Hz'
+    'reached: 0.1428 at 0 Hz'
     """
     peak = getattr(peak, "mu", peak)
     if not hasattr(peak, "upper_curve"):

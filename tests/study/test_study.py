@@ -72,6 +72,7 @@ ROW_KEYS = {
     "gamma",
     "mu_upper",
     "mu_lower",
+    "guaranteed",
     "mu_peak_Hz",
     "stable",
     "peak_transmissibility_dB",

@@ -100,7 +100,7 @@ def test_what_is_written_is_read_back(folder, rig, content):
     zeros, poles = ([complex(*root) for root in roots] for roots in (weight.zeros, weight.poles))
     W = weight.gain * np.prod([s - z for z in zeros], axis=0) / np.prod([s - p for p in poles], axis=0)
     assert np.all(np.abs(W) >= thin.bound(0.95) * (1 - 1e-9)) and len(poles) == weight.order
-    assert 0 <= weight.slack_dB <= 1 and np.all(np.real([*zeros, *poles]) < 0)
+    assert 0 <= weight.slack_dB <= 1.3 and np.all(np.real([*zeros, *poles]) < 0)
 
 
 def test_a_design_reads_it_beside_itself(folder, content):
