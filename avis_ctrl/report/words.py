@@ -72,7 +72,10 @@ def percent(share: float, digits: int = 3) -> str:
     return "< 0.001 %" if 0 < share < 1e-5 else f"{number(100 * share, digits)} %"
 
 
-def decibel(gain: float, side: Literal["", "upper", "lower"] = "") -> str:
+Side = Literal["", "upper", "lower"]
+
+
+def decibel(gain: float, side: Side = "") -> str:
     """A gain in dB, with its sign. side : "upper" (rounded up) or "lower" (rounded down) for a bound."""
     if np.isnan(gain):
         return "not computed"
@@ -80,18 +83,24 @@ def decibel(gain: float, side: Literal["", "upper", "lower"] = "") -> str:
         return "no bound"
     if gain <= 0:
         return "none"
-    tenths = 200 * np.log10(gain)
+    return _tenths(20 * np.log10(gain), side)
+
+
+def _tenths(value_dB: float, side: Side) -> str:
+    """Decibels with one digit behind the point; round-off of a millionth of it does not count."""
+    tenths = round(10 * float(value_dB), 6)
     tenths = {"upper": np.ceil, "lower": np.floor}.get(side, np.round)(tenths)
     return f"{tenths / 10:+.1f} dB".replace("-", "−")
 
 
-def quantity(value: float, unit: str, digits: int = 3) -> str:
-    """A number with its unit; a decibel with its sign, a count as a whole number."""
+def quantity(value: float, unit: str, digits: int = 3, side: Side = "") -> str:
+    """A number with its unit; a decibel with its sign, a count as a whole number. side : as for `decibel`."""
     if unit == "plants":
         return f"{value:.0f} plants"
     if unit == "dB" and not np.isnan(value):
-        return "no bound" if np.isposinf(value) else f"{value:+.1f} dB".replace("-", "−")
-    return f"{bound(value, digits)} {unit}".strip()
+        return "no bound" if np.isposinf(value) else _tenths(value, side)
+    text = {"upper": upper, "lower": lower}.get(side, bound)
+    return f"{text(value, digits)} {unit}".strip()
 
 
 def hertz(omega: float) -> str:

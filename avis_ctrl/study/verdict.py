@@ -15,7 +15,7 @@ from avis_ctrl.study.dc_gain import AtRest
 from avis_ctrl.study.design_file import Design, Quantity
 from avis_ctrl.study.design_result import AxisGain, ControllerResult, DesignResult, Requirement
 from avis_ctrl.study.limiting_bounds import no_better_than_none
-from avis_ctrl.summary import digits_apart, joined
+from avis_ctrl.summary import digits_apart, joined, rounded_down, rounded_up
 
 
 def _advantage(skyhook: ControllerResult, mu: ControllerResult) -> float:
@@ -198,7 +198,8 @@ def requirement_rows(result: DesignResult) -> list[tuple[str, str, str, bool]]:
         unit = f" {one.unit}" if one.unit else ""
         limit = "yes" if one.comparison == "is" else f"{one.comparison} {one.limit:.4g}{unit}"
         digits = 4 if one.met else digits_apart(one.value, one.limit, 4)
-        rows.append((one.name, limit, f"{one.value:.{digits}g}{unit}" if np.isfinite(one.value) else "-", one.met))
+        value = (rounded_up if one.comparison == "at most" else rounded_down)(one.value, digits)
+        rows.append((one.name, limit, f"{value:.{digits}g}{unit}" if np.isfinite(value) else "-", one.met))
     return rows
 
 

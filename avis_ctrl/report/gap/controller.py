@@ -32,8 +32,8 @@ def controller(effect: DesignEffect) -> Section:
             "mu, upper bound": lambda loop: Mark(words.upper(loop.figures.mu_upper), bool(loop.figures.mu_upper < 1)),
             "mu, lower bound": lambda loop: words.lower(loop.figures.mu_lower),
             "peak": lambda loop: words.quantity(loop.figures.peak_dB, "dB"),
-            "worst peak": lambda loop: words.quantity(loop.figures.worst_peak_dB, "dB"),
-            "worst in band": lambda loop: words.quantity(loop.figures.worst_band_dB, "dB"),
+            "worst peak": lambda loop: words.quantity(loop.figures.worst_peak_dB, "dB", side="upper"),
+            "worst in band": lambda loop: words.quantity(loop.figures.worst_band_dB, "dB", side="upper"),
         },
         "llccrrrrr",
     )

@@ -27,7 +27,12 @@ def verdict(result: DesignResult) -> Section:
         {
             "requirement": lambda r: r.name,
             "verdict": lambda r: Mark("met" if r.met else "NOT MET", r.met),
-            "result": lambda r: words.quantity(r.value, r.unit, 3 if r.met else digits_apart(r.value, r.limit, 3)),
+            "result": lambda r: words.quantity(
+                r.value,
+                r.unit,
+                3 if r.met else digits_apart(r.value, r.limit, 3),
+                "upper" if r.comparison == "at most" else "lower",
+            ),
             "limit": lambda r: f"{r.comparison} {words.quantity(r.limit, r.unit)}",
         },
         "lcrr",
