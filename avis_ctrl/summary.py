@@ -31,14 +31,19 @@ def wrapped(sentence: str) -> str:
     return fill(sentence, SETTINGS.line)
 
 
-def rounded_up(value: float, digits: int) -> float:
+def rounded_up(value: float, digits: int = 3) -> float:
     """The value with significant digits, rounded up: for upper bounds, which hold for larger values only."""
     return _directed(value, digits, ROUND_CEILING)
 
 
-def rounded_down(value: float, digits: int) -> float:
+def rounded_down(value: float, digits: int = 3) -> float:
     """The value with significant digits, rounded down: for lower bounds."""
     return _directed(value, digits, ROUND_FLOOR)
+
+
+def distinct_from_one(value: float, digits: int = 4) -> str:
+    """An upper bound of mu as text: rounded up, with enough digits not to look equal to 1."""
+    return f"{rounded_up(value, digits_apart(value, 1.0, digits)):.9g}"
 
 
 def _directed(value: float, digits: int, rounding: str) -> float:

@@ -151,11 +151,10 @@ def simulate_campaign(
         if plan
         else default_plan(table, "orthogonal" if orthogonal else "zippered", perturbed=perturbed, duration_s=duration_s)
     )
-    if write_plan is not None and not plan:
-        write_whole(write_plan, plan_toml(chosen).encode())
     if out is None:
         if write_plan is None or truth is not None:
             raise InputError("expected a file for the campaign", field="--out")
+        write_whole(write_plan, plan_toml(chosen).encode())
         terminal.print(f"{write_plan}: plan of a campaign, to edit; simulate it with --plan {write_plan} --out FILE.h5")
         return
     with Progress(terminal) as progress:

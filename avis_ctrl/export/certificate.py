@@ -22,7 +22,7 @@ from avis_ctrl.simulation.sampled_loop import SampledLoop
 from avis_ctrl.study.dc_gain import at_rest
 from avis_ctrl.study.random_plants import random_perturbations
 from avis_ctrl.study.simulation import with_delta
-from avis_ctrl.summary import digits_apart, rounded_up
+from avis_ctrl.summary import distinct_from_one
 
 Progress = Callable[[str], None]
 
@@ -74,10 +74,7 @@ class Certificate:
 
 
 def _upper(value: float | None) -> str:
-    """An upper bound with four significant digits, rounded up; more if it would look like 1."""
-    if value is None or not np.isfinite(value):
-        return "unbounded"
-    return f"{rounded_up(value, digits_apart(value, 1.0, 4)):.9g}"
+    return "unbounded" if value is None or not np.isfinite(value) else distinct_from_one(value)
 
 
 def shipped_loop(folder: DesignFolder, controller: SampledController) -> SampledLoop:

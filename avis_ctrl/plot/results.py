@@ -11,7 +11,7 @@ from avis_ctrl.errors import InputError
 from avis_ctrl.lti.norms import in_dB
 from avis_ctrl.plot.axes import HERTZ, axes_of, finish, limit_line, log_if_wide, whole_numbers
 from avis_ctrl.rigs.vibration_criteria import CRITERIA
-from avis_ctrl.summary import digits_apart, rounded_down, rounded_up
+from avis_ctrl.summary import distinct_from_one, rounded_down
 
 # Palette of Okabe and Ito; controllers have the same colours as in the report.
 COLOURS = {
@@ -54,8 +54,8 @@ def mu(peak: Any, ax: Any = None, *, label: str = "mu", color: str = COLOURS["mu
     ax.plot(f[shown], lower[shown], color=LOWER, linestyle="--", label=f"{label}, lower bound")
     if np.isfinite(peak.upper):
         worth = "proved between all points" if peak.guaranteed else "at the computed points only"
-        upper = rounded_up(peak.upper, digits_apart(peak.upper, 1.0, 4))
-        limit_line(ax, peak.upper, f"peak at most {upper:.9g}, {worth}", color=color, linestyle="--")
+        label_of_peak = f"peak at most {distinct_from_one(peak.upper)}, {worth}"
+        limit_line(ax, peak.upper, label_of_peak, color=color, linestyle="--")
     if np.isfinite(peak.lower) and peak.lower > 0 and np.isfinite(peak.omega):
         at = peak.omega / HERTZ
         # Zero has no place on the axis. With real parameters alone, mu can be zero at all other frequencies.

@@ -143,7 +143,7 @@ def _peak(N: StateSpace, blocks: BlockStructure, slack: float) -> MuPeak:
 
 
 def _with_open_channels(found: DiskMargin, names: list[str], closed: list[str], skew: float) -> DiskMargin:
-    """The margin with the factors of all channels; that of a channel in no loop is infinite only at 2/(1 + sigma)."""
+    """The margin with the factors of all channels. A factor in no loop has no limit but its own pole, 2/(1 + sigma)."""
     if len(closed) == len(names):
         return found
     delta = None

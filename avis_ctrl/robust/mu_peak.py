@@ -319,11 +319,11 @@ def _mu_peak(
     # One stage is enough for the curve; the search continues at the peaks only.
     lower = lower_bound(N.frequency_response(omega), structure, *bound, enough=0.9, stages=1)
     done = _cover_mu(N, structure, level, accuracy, slack)
-    given = known_upper is not None and known_upper <= (1 + SETTINGS.known_slack) * level
-    if known_upper is not None and given:
-        done.level = known_upper
-    else:
+    given = None if known_upper is None or known_upper > (1 + SETTINGS.known_slack) * level else known_upper
+    if given is None:
         done.run(band, peak)
+    else:
+        done.level = given
     # The proof finds resonances that are narrower than the spacing of the frequencies computed before.
     if (missed := np.setdiff1d(done.raised_at, omega)).size:
         more = bound_of_peak((M := N.frequency_response(missed))[:, None], structure, accuracy)
@@ -334,10 +334,10 @@ def _mu_peak(
     best, at, delta = _best_singular(N, structure, omega, bound, lower, done, band)
     if best > done.level:
         # mu of real blocks can jump at a single frequency outside any grid; the search with free frequency found one.
-        done, given = _cover_mu(N, structure, best * (1 + slack), accuracy, slack).run(band, np.array([at])), False
+        done, given = _cover_mu(N, structure, best * (1 + slack), accuracy, slack).run(band, np.array([at])), None
     if best == 0.0:
         at = float(peak[0])
-    words = f"{_span(band, dt)}: the bound that was given" if given else _in_words(done, band, dt)
+    words = f"{_span(band, dt)}: the bound that was given" if given is not None else _in_words(done, band, dt)
     return MuPeak(done.level, best, at, delta, not done.gaps, words, omega, bound.beta, lower.beta)
 
 
@@ -395,7 +395,7 @@ def _worst_case_gain(
     searched, reached = _searched(N, band, slack, lambda M: worst_gain(M, structure))
     reached = with_neighbours(N.frequency_response(searched), reached, structure)
     kept = _thinned(reached.gain, points)
-    omega = searched[kept]
+    omega, lower = searched[kept], reached.gain[kept]
     upper = bound(N.frequency_response(omega)[:, None])
     done = None
     proved = known is not None and known.guaranteed and known.upper < 1.0
@@ -404,11 +404,13 @@ def _worst_case_gain(
     if done is not None and np.isfinite(done.level):
         if (missed := np.setdiff1d(done.raised_at, searched)).size:
             M = N.frequency_response(missed)
-            searched, reached = np.concatenate([searched, missed]), joined([reached, worst_gain(M, structure)])
-            kept = np.concatenate([kept, np.arange(searched.size - missed.size, searched.size)])
-            kept = kept[np.argsort(searched[kept])]
-            upper = np.concatenate([upper, bound(M[:, None])])[np.argsort(np.concatenate([omega, missed]))]
-            omega = searched[kept]
+            more = worst_gain(M, structure)
+            searched, reached = np.concatenate([searched, missed]), joined([reached, more])
+            order = np.argsort(np.concatenate([omega, missed]))
+            omega, upper, lower = (
+                np.concatenate(both)[order]
+                for both in ((omega, missed), (upper, bound(M[:, None])), (lower, more.gain))
+            )
         k = int(np.argmax(reached.gain))
         return MuPeak(
             done.level,
@@ -419,7 +421,7 @@ def _worst_case_gain(
             _in_words(done, band, dt),
             omega,
             upper,
-            reached.gain[kept],
+            lower,
         )
     robust = known or _robustness(N.select(range(n_z), range(n_w)), structure, slack)
     if robust.lower >= 1.0:

@@ -109,6 +109,11 @@ class ControllerResult(Candidate):
     rest: AtRest | None = None
 
     @property
+    def guaranteed(self) -> bool:
+        """Whether the upper bounds are proved between the computed frequencies, too."""
+        return all(bound.guaranteed for bound in (self.mu, self.worst_peak, self.worst_band))
+
+    @property
     def order(self) -> int:
         """Number of states of the controller."""
         return self.K.nstates if self.K is not None else 0

@@ -21,7 +21,7 @@ from avis_ctrl.robust.mu_upper import bound_for_goal, bound_of_peak
 from avis_ctrl.study.design_result import ControllerResult
 from avis_ctrl.study.identified_uncertainty import RESPONSE
 from avis_ctrl.study.plant import DesignPlant
-from avis_ctrl.summary import joined
+from avis_ctrl.summary import joined, rounded_down, rounded_up
 from avis_ctrl.uncertainty.blocks import BlockStructure
 from avis_ctrl.uncertainty.weights import ControlEffort, TransmissibilityBound
 
@@ -75,13 +75,13 @@ def limiting(plant: DesignPlant, mu: ControllerResult) -> str:
         where = _unproved(most) or " over all frequencies"
         text += (
             f" The limiting bound there is the {name}{_part(plant, name, omega)}: without it, mu of this controller is "
-            f"at most {_up(value):g} at this frequency, and at most {_up(most.upper):g}{where}; its upper bound then "
-            f"peaks at {_hertz(_peak(rest))}."
+            f"at most {rounded_up(value):g} at this frequency, and at most {rounded_up(most.upper):g}{where}; its "
+            f"upper bound then peaks at {_hertz(_peak(rest))}."
         )
-        others = [f"the {name} (mu at most {_up(value):g} without it)" for value, name in bounds[1:]]
+        others = [f"the {name} (mu at most {rounded_up(value):g} without it)" for value, name in bounds[1:]]
         text += f" Also limiting: {joined(others)}." if others else ""
     if shares:
-        named = [f"{name} (mu at most {_up(value):g} without it)" for value, name in shares[: SETTINGS.most]]
+        named = [f"{name} (mu at most {rounded_up(value):g} without it)" for value, name in shares[: SETTINGS.most]]
         text += f" The largest contributions of uncertainties there: {joined(named)}."
     if not bounds and not shares:
         return (
@@ -104,8 +104,8 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     if no_better_than_none(mu, others):
         return (
             f"The synthesis found no controller better than none: with the best controller found mu is at most "
-            f"{_up(mu.mu.upper):g}, at {_hertz(omega)}; this bound is less than {100 * SETTINGS.idle:g} % below that "
-            f"without control. No D-K iteration came closer to the bounds with this uncertainty. "
+            f"{rounded_up(mu.mu.upper):g}, at {_hertz(omega)}; this bound is less than {100 * SETTINGS.idle:g} % "
+            f"below that without control. No D-K iteration came closer to the bounds with this uncertainty. "
             f"{spread or _not_even_nominal(plant) or 'Specify less uncertainty or wider bounds'}".rstrip(".")
             + "."
         )
@@ -113,7 +113,7 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     text = (
         f"The specification (weighted norm below 1 for all plants of the set) is not "
         f"{'met' if mu.mu.lower >= 1 else 'proved to be met'}: mu of the mu controller is between "
-        f"{_down(mu.mu.lower, 4):g} and {_up(mu.mu.upper, 4):g}{_unproved(mu.mu)} and must be below 1. "
+        f"{rounded_down(mu.mu.lower, 4):g} and {rounded_up(mu.mu.upper, 4):g}{_unproved(mu.mu)} and must be below 1. "
         f"{limits} {_not_even_nominal(plant) or _relief(plant, mu)}"
     )
     if spread and RESPONSE in limits:
@@ -121,8 +121,8 @@ def best_found(plant: DesignPlant, mu: ControllerResult, others: Sequence[Contro
     if better := [c for c in others if c.mu.upper < mu.mu.upper]:
         best = min(better, key=lambda c: c.mu.upper)
         text += (
-            f" The controller {best.title!r} has a smaller upper bound of mu, {_up(best.mu.upper):g}: the iteration "
-            f"ended too early."
+            f" The controller {best.title!r} has a smaller upper bound of mu, {rounded_up(best.mu.upper):g}: the "
+            "iteration ended too early."
         )
     return text
 
@@ -152,7 +152,7 @@ def _not_even_nominal(plant: DesignPlant) -> str:
 
     return (
         f"No controller has a weighted norm (all bounds and disturbances together) below 1, even without uncertainty: "
-        f"it is at least {_down(least, 4):g}. Each bound alone may still be met. "
+        f"it is at least {rounded_down(least, 4):g}. Each bound alone may still be met. "
         + _enough("Without uncertainty a controller reaches 1", _wider(plant, met))
     )
 
@@ -174,14 +174,16 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
         return below_one(_rows(plant, name), factor)
 
     text = (
-        f"This controller meets the specification if every uncertainty is divided by {_up(mu.mu.upper, 4):g} (which "
-        f"follows from mu) and every bound is relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
+        f"This controller meets the specification if every uncertainty is divided by {rounded_up(mu.mu.upper, 4):g} "
+        f"(which follows from mu) and every bound is relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
     )
     if not M.size:
         return text
     ways = _wider(plant, met)
     if (smaller := _least_dB(lambda factor: below_one(range(P.blocks.n_z), factor))) is not None:
-        ways.append(f"all uncertainties are reduced to {_down(100 * 10 ** (-smaller / 20), 2):g} % of their size")
+        ways.append(
+            f"all uncertainties are reduced to {rounded_down(100 * 10 ** (-smaller / 20), 2):g} % of their size"
+        )
     return f"{_enough('At the computed frequencies this controller meets it', ways)} {text}"
 
 
@@ -269,18 +271,6 @@ def _peak(bound: MuPeak) -> float:
 def _unproved(bound: MuPeak) -> str:
     """Words for an upper bound that is not proved between the computed frequencies."""
     return "" if bound.guaranteed else " at the computed frequencies"
-
-
-def _up(value: float, digits: int = 3) -> float:
-    """Rounded up to some significant digits."""
-    if not (np.isfinite(value) and value):
-        return value
-    step = 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1)
-    return float(f"{np.ceil(value / step - 1e-9) * step:.{digits}g}")
-
-
-def _down(value: float, digits: int = 3) -> float:
-    return -_up(-value, digits)
 
 
 def _decibel(value: float) -> str:

@@ -99,7 +99,7 @@ def _controller_row(c: ControllerResult) -> dict[str, Any]:
         "gamma": c.gamma,
         "mu_upper": c.mu.upper,
         "mu_lower": c.mu.lower,
-        "guaranteed": c.mu.guaranteed and c.worst_peak.guaranteed and c.worst_band.guaranteed,
+        "guaranteed": c.guaranteed,
         "mu_peak_Hz": c.mu.omega / (2 * np.pi),
         "stable": c.stable,
         "peak_transmissibility_dB": decibels(c.peak_transmissibility),

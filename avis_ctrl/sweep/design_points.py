@@ -103,7 +103,7 @@ def compute(design: Design, rig: Rig, skyhook: bool) -> tuple[dict[str, Any], di
     figures = {
         "mu_upper": found.mu.upper,
         "mu_lower": found.mu.lower,
-        "guaranteed": found.mu.guaranteed and found.worst_peak.guaranteed and found.worst_band.guaranteed,
+        "guaranteed": found.guaranteed,
         "worst_case_peak_transmissibility_dB": decibels(found.worst_peak.upper),
         BAND: decibels(found.worst_band.upper),
         "order": found.order,

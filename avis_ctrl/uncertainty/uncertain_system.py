@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.checks import require_whole
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.interchange import as_system, plot_frequencies
 from avis_ctrl.lti.interconnection import (
@@ -225,8 +226,7 @@ class UncertainSystem:
     def values(self, n: int = 1, seed: int = 0) -> list[dict[str, Any]]:
         """n random sets of values for `substitute`: real parameters are uniform over their range; complex ones and
         dynamics are a first-order all-pass times a gain of at most 1, with a corner in the system's frequency range."""
-        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 0:
-            raise InputError("expected a whole number", field="n", value=n)
+        require_whole(n, "n", 0)
         rng = np.random.default_rng(seed)
         grid = np.array([0.1, 10.0])
         if self.nstates:

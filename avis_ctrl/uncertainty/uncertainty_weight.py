@@ -126,11 +126,11 @@ def uncertainty_weight(
     omega = np.unique(np.asarray(omega, float))
     if not (omega.size and np.all(np.isfinite(omega)) and omega[0] >= 0 and omega[-1] > 0):
         raise InputError("expected frequencies from 0 on, one of them positive", field="omega")
-    unstable = [None if is_response(one) else _unstable_poles(one) for one in (nominal, *every)]
-    for k, count in enumerate(unstable[1:]):
-        if None not in (count, unstable[0]) and count != unstable[0]:
+    unstable = None if is_response(nominal) else _unstable_poles(nominal)
+    for k, one in enumerate(every):
+        if unstable is not None and not is_response(one) and (count := _unstable_poles(one)) != unstable:
             raise InputError(
-                f"expected {unstable[0]} unstable poles, as many as those of the nominal system: no stable Delta makes "
+                f"expected {unstable} unstable poles, as many as those of the nominal system: no stable Delta makes "
                 "this system from the nominal one",
                 field=f"response {k}",
                 value=count,

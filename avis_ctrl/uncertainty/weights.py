@@ -17,9 +17,8 @@ class TransmissibilityBound(Weight):
 
     A rational filter has no steps. On the grid it is nowhere less strict than specified. Within `transition_octaves`
     outside a stricter band it may be stricter than specified, elsewhere by about `tolerance_dB` at most (`excess_dB` is
-    the result). It has the lowest
-    order that achieves this. The limit applies from a hundredth of the lower to a hundred times the upper edge of the
-    band, and the filter is flat outside.
+    the result). It has the lowest order that achieves this. The limit applies from a hundredth of the lower to a
+    hundred times the upper edge of the band, and the filter is flat outside.
     """
 
     peak_dB: float
@@ -52,9 +51,14 @@ class TransmissibilityBound(Weight):
         shape = smallest_cover(
             omega, lower, upper, self.tolerance_dB, self.max_order, "the transmissibility bound", target
         )
-        dense = 2 * np.pi * self._grid(4000, 400)
+        dense = 2 * np.pi * self._dense
         # 1e-4 covers violations between the dense points.
         return shape.scaled(max(1.0, float(np.max(1.0 / (self.asked(dense) * shape.magnitude(dense)))) * (1 + 1e-4)))
+
+    @cached_property
+    def _dense(self) -> np.ndarray:
+        """Frequencies [Hz] at which the filter is compared with the bounds."""
+        return self._grid(4000, 400)
 
     def _grid(self, points: int, fine_points: int) -> np.ndarray:
         """Frequencies [Hz], evenly spaced in logarithm, dense about both steps and on both sides of them."""
@@ -77,9 +81,8 @@ class TransmissibilityBound(Weight):
     @cached_property
     def excess_dB(self) -> float:
         """By how much the filter is stricter than the bounds, at most, outside the transitions [dB]."""
-        f = self._grid(4000, 400)
-        away = np.min(np.abs(np.log2(f[:, None] / np.array(self.band_Hz))), axis=1) >= self.transition_octaves
-        omega = 2 * np.pi * f[away]
+        away = np.min(np.abs(np.log2(self._dense[:, None] / np.array(self.band_Hz))), axis=1)
+        omega = 2 * np.pi * self._dense[away >= self.transition_octaves]
         return float(20 * np.log10(np.max(self.asked(omega) * self.shape.magnitude(omega))))
 
 
@@ -102,8 +105,8 @@ class ComplianceBound(Weight):
 class ControlEffort(Weight):
     """Voltage of an actuator: at most its limit if the floor has the expected velocity.
 
-    W = (level / limit) (s/wb + 1)/(s/(R wb) + 1): up to wb the full limit may be used, far above it only the fraction
-    1/R, so that the controller rolls off. Below a corner w0, W is larger by the factor (s + k w0)/(s + w0),
+    W = (velocity / limit) (s/wb + 1)/(s/(R wb) + 1): up to wb the full limit may be used, far above it only the
+    fraction 1/R, so that the controller rolls off. Below a corner w0, W is larger by the factor (s + k w0)/(s + w0),
     k = sqrt(1 + offset^2), so that the controller also rolls off towards zero frequency.
 
     Parameters
@@ -134,16 +137,14 @@ class ControlEffort(Weight):
     def meaning(self) -> str:
         text = (
             f"at most {self.limit_V:g} V for a floor velocity of {self.floor_velocity_m_per_s:.3g} m/s, up to "
-            f"{self.bandwidth_Hz:g} "
-            f"Hz; above that the permitted voltage falls at 20 dB per decade to {1 / self.reduction:.2g} times this "
-            "value"
+            f"{self.bandwidth_Hz:g} Hz; above that the permitted voltage falls at 20 dB per decade to "
+            f"{1 / self.reduction:.2g} times this value"
         )
         if not self.offset:
             return text
         return (
             f"{text}; below {self.offset_corner_Hz:g} Hz it is {np.hypot(1, self.offset):.3g} times smaller, because "
-            "of "
-            "the offset of the electronics"
+            "of the offset of the electronics"
         )
 
 
