@@ -175,7 +175,8 @@ def _relief(plant: DesignPlant, mu: ControllerResult) -> str:
 
     text = (
         f"This controller meets the specification if every uncertainty is divided by {rounded_up(mu.mu.upper, 4):g} "
-        f"(which follows from mu) and every bound is relaxed by {_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
+        "(which follows from mu) and every bound is relaxed by "
+        f"{_decibel(20 * np.log10(mu.mu.upper))}{_unproved(mu.mu)}."
     )
     if not M.size:
         return text
