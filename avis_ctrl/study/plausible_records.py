@@ -38,6 +38,9 @@ class RecordPlausibility:
     gain_decades : gain errors that are tried. rig_factors : errors of the rig's parameters that are tried.
     coherent : multiple coherence from which the power of a band counts as response to the drives.
     records, samples, lines : maximum numbers used, for speed. octaves : width of a band.
+    least_bands : a sensor is compared if it responds to the drives in this number of bands (in all that are driven, if
+        these are fewer), because a unit error acts in all of them. Where most of the response is incoherent, as
+        with two clocks that differ, the level in the rest of the bands is no measure of a unit.
     hopeless : distance above which records are refused even if no single error explains them: a factor of about 30.
     rare : penalty added to the distance for an error other than three decades. scope : penalty for an error other than
         a common gain; half of it for a single channel, so that the simplest of similar errors is named.
@@ -55,6 +58,7 @@ class RecordPlausibility:
     samples: int = 1 << 17
     lines: int = 300
     octaves: float = 1 / 3
+    least_bands: int = 3
     hopeless: float = 1.5
     rare: float = 0.02
     scope: float = 0.02
@@ -68,6 +72,10 @@ Candidate = tuple[float, str, object, str]
 # Units of the rig parameters that are tried. Factors of a channel's gain are not among them, because an error of one of
 # them cannot be distinguished from an error of another.
 UNITS = ("kg", "kg m^2", "N/m", "N s/m", "N m/rad", "N m s/rad")
+
+
+class ImplausibleRecordsError(InputError):
+    """Records that a unit error explains, or that no table similar to the rig could have produced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +122,10 @@ def distance(decades: np.ndarray) -> float:
 def records_fit(
     measured: Campaign, model: ResponseModel, despite: bool, progress: Callable[[str], None]
 ) -> tuple[Finding, ...]:
-    """`check_records`; with `despite`, its error is only reported as a line of progress. Errors of reading are not."""
-    seen = record_spectra(measured)
+    """`check_records`; with `despite`, implausible records are only reported as a line of progress."""
     try:
-        return _checked(measured, model, seen)
-    except InputError as error:
+        return check_records(measured, model)
+    except ImplausibleRecordsError as error:
         if not despite:
             raise InputError(
                 f"{error.expected}; --despite-gates continues anyway", field=error.field, value=error.value
@@ -132,12 +139,9 @@ def check_records(measured: Campaign, model: ResponseModel) -> tuple[Finding, ..
 
     Returns warnings on sensors that are off by one factor in all bands; these do not stop the analysis.
 
-    Raises InputError: one line that names the field and the likely error.
+    Raises ImplausibleRecordsError: one line that names the field and the likely error.
     """
-    return _checked(measured, model, record_spectra(measured))
-
-
-def _checked(measured: Campaign, model: ResponseModel, seen: RecordSpectra | None) -> tuple[Finding, ...]:
+    seen = record_spectra(measured)
     if seen is None:
         return ()
     errors = UnitErrors(measured, model, seen)
@@ -150,9 +154,9 @@ def _checked(measured: Campaign, model: ResponseModel, seen: RecordSpectra | Non
     found = [one for one in sorted(errors.corrected(), key=lambda one: one[0]) if one[0] <= enough]
     if found:
         _, field, value, question = found[0]
-        raise InputError(f"{said}; {question}", field=field, value=value)
+        raise ImplausibleRecordsError(f"{said}; {question}", field=field, value=value)
     if before > SETTINGS.hopeless:
-        raise InputError(
+        raise ImplausibleRecordsError(
             f"{said}, and no single wrong unit explains it; check the units of y and u, sensitivities, gains and "
             "force constants",
             field="records",
@@ -200,8 +204,9 @@ def record_spectra(measured: Campaign) -> RecordSpectra | None:
     bands = np.array([number == k for k in np.unique(number)], float)
     coherence = bands @ estimate.coherence[place] / bands.sum(axis=1)[:, None]
     power = bands @ np.sum(np.abs(Y) ** 2, axis=0)
-    answered = np.where((coherence > SETTINGS.coherent) & (power > 0), power, np.nan)
-    return RecordSpectra(peak_u, peak_y, 2 * np.pi * f, U, answered, bands)
+    responds = (coherence > SETTINGS.coherent) & (power > 0)
+    responds &= responds.sum(axis=0) >= min(SETTINGS.least_bands, len(bands))
+    return RecordSpectra(peak_u, peak_y, 2 * np.pi * f, U, np.where(responds, power, np.nan), bands)
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +240,7 @@ class UnitErrors:
         off: list[tuple[str, float, str]] = []
         for name, column in zip(self.measured.y_names, self.decades.T, strict=True):
             there = column[np.isfinite(column)]
-            middle = float(np.median(there)) if there.size >= 3 else 0.0
+            middle = float(np.median(there)) if there.size >= SETTINGS.least_bands else 0.0
             if abs(middle) > SETTINGS.far and np.median(np.abs(there - middle)) < SETTINGS.fits:
                 off.append((kinds.get(name, ""), middle, name))
         alike: list[list[tuple[str, float, str]]] = []

@@ -195,6 +195,19 @@ def test_strong_hidden_effects_pass(name, place, values):
     check_records(campaign(rig, lambda omega: hidden.response(omega)[:, :, :8]), model_of(rig, plain))
 
 
+def test_a_sensor_that_responds_in_one_band_only_is_no_evidence_of_a_unit():
+    """Two clocks that differ make most bands incoherent, and lower the level in the rest."""
+    rig = load_rig("avis")
+    measured = campaign(rig)
+
+    def narrow(omega: np.ndarray) -> np.ndarray:
+        return 0.2 * by_hand(rig, omega) * (omega < 2 * np.pi * 1.0)[:, None, None]
+
+    seen = record_spectra(campaign(rig, narrow))
+    assert len(seen.bands) > 10 and not np.isfinite(seen.power).any()
+    assert check_records(campaign(rig, narrow), model_of(rig, measured)) == ()
+
+
 @pytest.mark.parametrize("name, seed", [("avis", 1), ("avis", 2), ("halcyonics", 3), ("halcyonics", 4)])
 def test_rigs_off_by_thirty_per_cent_pass_with_room(name, seed):
     """Every parameter but places off by up to 30 % at once, in the file against the truth."""
