@@ -10,6 +10,7 @@ import pytest
 
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.study.design_file import read_study
+from avis_ctrl.study.identification_design import default_band
 
 avis = functools.partial(avis_command.avis, answers="\n" * 12, env={"COLUMNS": "120"})
 
@@ -163,3 +164,11 @@ def test_the_shell_completes_commands_and_options():
     for words, expected in (("avis sim", "simulate-campaign"), ("avis new ", "rig"), ("avis design --o", "--out")):
         done = avis(env={"_AVIS_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))})
         assert expected in done.stdout.split(), words
+
+
+def test_the_band_is_scaled_with_the_natural_frequencies():
+    """Mounts four times as stiff double all natural frequencies."""
+    rig = load_rig("avis")
+    k = {name: 4 * p.value for name, p in rig.parameters().items() if ".k_" in name}
+    assert default_band(rig) == (1.0, 10.0)
+    assert default_band(rig.with_parameters(k)) == (2.0, 20.0)

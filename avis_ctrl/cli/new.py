@@ -159,7 +159,7 @@ def _design_fields(given: dict[str, Any]) -> dict[str, Any]:
     if "keep" in fields:
         fields["keep"] = tuple(fields["keep"].replace(",", " ").split())
     if "band_Hz" in fields:
-        fields["band_Hz"] = _numbers(fields["band_Hz"], 2, "--band")
+        fields["band_Hz"] = _numbers(fields["band_Hz"], 2, "--band") if fields["band_Hz"].strip() else ()
     return fields
 
 
@@ -175,7 +175,10 @@ def design(
     keep: Annotated[
         str, _of_design("--keep", "Coordinates under one controller, such as z, phi_x (empty: chosen for the rig)")
     ] = "",
-    band_Hz: Annotated[str, _of_design("--band", "Band in which the table must isolate [Hz]")] = "1, 10",
+    band_Hz: Annotated[
+        str,
+        _of_design("--band", "Band in which the table must isolate [Hz] (empty: scaled with the natural frequencies)"),
+    ] = "",
     peak_dB: Annotated[float, _of_design("--peak-limit", "Transmissibility at any frequency, at most [dB]")] = 3.5,
     band_dB: Annotated[float, _of_design("--band-limit", "Transmissibility in the band, at most [dB]")] = -7.0,
     mass_percent: Annotated[float, _of_design("--mass", "Mass known to within [%]")] = 10.0,
@@ -194,9 +197,10 @@ def design(
     made = new_design(NewDesign(**given), load_rig(rig), named)
     write_whole(out, design_text(made).encode())
     read_study(out)
+    low, high = made.transmissibility.band_Hz
     print(
-        f'{out}: written. Next: replace the values marked "Assumed", then run avis design {out} --out '
-        f"{out.with_suffix('')}"
+        f"{out}: written; the table has to isolate from {low:g} to {high:g} Hz.\n"
+        f'Next: replace the values marked "Assumed", then run avis design {out} --out {out.with_suffix("")}'
     )
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import gmean
 
 from avis_ctrl.errors import InputError
 from avis_ctrl.identification.campaign_fit import SETTINGS, driven_inputs, excited_band
@@ -185,9 +186,22 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
     return design_from_table(shape | own | {"requirement": [*shape["requirement"], fastest]})
 
 
+def _shipped(rig: Rig) -> Rig:
+    """The table of the same kind for which the weights of `default_design` were chosen."""
+    return load_rig("avis" if isinstance(rig, IsolatorTable) else "halcyonics_loaded")
+
+
+def default_band(rig: Rig) -> tuple[float, float]:
+    """Band of isolation [Hz] of the shipped design, scaled by the geometric mean of the natural frequencies."""
+    shape = _AVIS if isinstance(rig, IsolatorTable) else _HALCYONICS
+    low, high = (gmean(one.equations_of_motion().natural_frequencies().frequencies_Hz) for one in (_shipped(rig), rig))
+    first, last = (float(f"{f * high / low:.2g}") for f in shape["transmissibility"]["band_Hz"])
+    return first, last
+
+
 def assumed_weights(rig: Rig) -> str:
     """Comment lines above a `default_design`: the table for which its weights were chosen, compared with this one."""
-    shipped = load_rig("avis" if isinstance(rig, IsolatorTable) else "halcyonics_loaded")
+    shipped = _shipped(rig)
     lines = [
         "No weights were specified for this table. [loop], [uncertainty.actuator_chains], [transmissibility],",
         "[control_effort] and [[requirement]] are those of the shipped design for the first of these two tables:",

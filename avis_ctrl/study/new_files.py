@@ -19,7 +19,7 @@ from avis_ctrl.rigs.plausibility import UnusualRig, plausible
 from avis_ctrl.rigs.rig import Rig
 from avis_ctrl.rigs.rig_file import rig_from
 from avis_ctrl.study.design_file import Design, design_from_table
-from avis_ctrl.study.identification_design import default_design, design_toml
+from avis_ctrl.study.identification_design import default_band, default_design, design_toml
 
 
 @dataclass(frozen=True)
@@ -195,13 +195,13 @@ class NewDesign:
     """Answers for a new design.
 
     keep : coordinates under one controller; empty for those of the default design. band_Hz : band in which the
-        transmissibility stays below band_dB [dB]; peak_dB : limit at all other frequencies. The ranges of mass, and of
-        stiffness and damping of every mount, are in per cent of the rig file's values.
+        transmissibility stays below band_dB [dB]; `default_band` if empty. peak_dB : limit at all other frequencies.
+        The ranges of mass, and of stiffness and damping of every mount, are in per cent of the rig file's values.
     """
 
     title: str
     keep: tuple[str, ...] = ()
-    band_Hz: tuple[float, ...] = (1.0, 10.0)
+    band_Hz: tuple[float, ...] = ()
     band_dB: float = -7.0
     peak_dB: float = 3.5
     mass_percent: float = 10.0
@@ -225,7 +225,8 @@ def new_design(new: NewDesign, rig: Rig, rig_name: str) -> Design:
     shape = start.model_dump(exclude_none=True)
     shape["rig"] = rig_name
     shape["keep"] = list(new.keep) or shape["keep"]
-    shape["transmissibility"] |= {"band_Hz": list(new.band_Hz), "band_dB": new.band_dB, "peak_dB": new.peak_dB}
+    band = list(new.band_Hz or default_band(rig))
+    shape["transmissibility"] |= {"band_Hz": band, "band_dB": new.band_dB, "peak_dB": new.peak_dB}
     limits = {"worst_case_peak_transmissibility_dB": new.peak_dB, "worst_case_band_transmissibility_dB": new.band_dB}
     for one in shape["requirement"]:
         if one["quantity"] in limits:
