@@ -30,7 +30,7 @@
       ...layout, ...axes, height: plot + 26 + foot, paper_bgcolor: "#fff", plot_bgcolor: "#fff",
       font: { family: "system-ui, 'DejaVu Sans', sans-serif", size: phone ? 11 : 12.5, color: "#1d1d1f" },
       margin: { l: phone ? 52 : 68, r: 12, t: 26, b: foot },
-      legend: { orientation: "h", x: 0, xanchor: "left", y: -(48 + turned) / plot, yanchor: "top", itemsizing: "constant" },
+      legend: { orientation: "h", x: 0, xanchor: "left", y: -(48 + turned) / plot, yanchor: "top", itemsizing: "constant", itemwidth: 46 },
       hovermode: "closest", dragmode: phone ? false : "zoom",
     }, { responsive: true, displaylogo: false, displayModeBar: phone ? false : "hover",
       modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
