@@ -36,6 +36,10 @@ class StartSettings:
         resonance.
     peak_dampings : the same at the peaks of the residual [1], whose frequency is known better.
     followed_places : number of places at which three frequencies are searched on a finer grid, the best first.
+    turned_places : number of these places at which rotated axes are searched.
+    axes_damping : damping ratio of the search of three frequencies [1].
+    most_turned, turns : largest rotation of the axes that is searched [rad], to which any three orthogonal axes can be
+        brought by permutation, and number of steps about each axis.
     narrowest : minimum damping ratio for the frequency grid of a sprung mass, or of a chassis around a fit [1]; a
         smaller one would need more frequencies than a search can afford.
     stiff_Hz : frequency of a sprung mass along an axis in which it shows no resonance [Hz]: above the band.
@@ -78,6 +82,10 @@ class StartSettings:
     dampings: tuple[float, ...] = (0.03, 0.15)
     peak_dampings: tuple[float, ...] = (0.01, 0.05)
     followed_places: int = 6
+    turned_places: int = 2
+    axes_damping: float = 0.05
+    most_turned: float = 1.1
+    turns: int = 9
     narrowest: float = 0.02
     stiff_Hz: float = 150.0
     mode_Hz: tuple[float, float, int] = (7.0, 140.0, 22)

@@ -9,6 +9,7 @@ import pytest
 from assembled_table import Assembly, mount_map
 from noise_fit import fitted, reported
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.effects.impedance import peaks
@@ -358,6 +359,31 @@ def test_seed_of_a_sprung_mass_with_three_frequencies():
     assert np.linalg.norm(np.array(found[0].values[5:]) - PLACE) < 0.25
     _, one = seeds_of(truth, "attached_oscillator", "payload/oblique")
     assert found[0].chi2 > 1.2 * one[0].chi2
+
+
+@pytest.mark.parametrize("turn", [(0.4, -0.3, 0.5), (-0.6, 0.5, 0.9), (2.0, -1.0, 0.7)])
+def test_seed_of_a_sprung_mass_along_turned_axes(turn):
+    """Any three orthogonal axes are found as a permutation of x, y, z with a smaller rotation."""
+    frequencies, place = np.array([9.0, 4.7, 12.6]), (0.28, -0.1, 0.04)
+    axes = expm(np.cross(np.eye(3), turn))
+    small = Rotation.from_matrix(axes @ permutation(axes))
+    values = [1.0, *(frequencies @ np.abs(permutation(axes))), 0.04, *place, *small.as_rotvec()]
+    truth = with_effect("attached_oscillator", "payload/turned", values, FREE)
+    score, found = seeds_of(truth, "attached_oscillator", "payload/turned")
+    _, straight = seeds_of(truth, "attached_oscillator", "payload/axes")
+    assert found[0].chi2 > 0.8 * score.chi2 and found[0].chi2 > 1.1 * straight[0].chi2
+    assert np.linalg.norm(np.array(found[0].values[5:8]) - place) < 0.1
+    d = Rotation.from_rotvec(found[0].values[8:]).as_matrix().T
+    for f, axis in zip(frequencies, axes.T, strict=True):
+        k = int(np.argmin(np.abs(np.log(np.array(found[0].values[1:4]) / f))))
+        assert found[0].values[1 + k] == pytest.approx(f, rel=0.1)
+        assert abs(d[k] @ axis) > np.cos(np.radians(20.0))
+
+
+def permutation(axes):
+    """(3, 3) signed permutation of the columns of a rotation that brings it nearest to the identity."""
+    group = Rotation.create_group("O").as_matrix()
+    return max(group, key=lambda one: np.trace(axes @ one))
 
 
 @pytest.mark.parametrize("place", [(-0.076, -0.12, 0.024), (0.31, 0.4, -0.18), (-0.5, 0.1, 0.28)])

@@ -68,19 +68,14 @@ class AttachedOscillator(AtPoint):
             ops.inner.append(row[:, None] / second_order(ops.s, frequency, values["damping"])[:, None, None])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Seeds over frequencies, damping ratios, places and directions; the mass follows from the score test. Turned
-        axes start from axes along x, y and z (`extended_models`)."""
-        if place.endswith("turned"):
-            return []
+        """Seeds over frequencies, damping ratios, places and directions; the mass follows from the score test."""
         parameters = self.parameters(score.model, place)
-        found = _along_three_axes(score, parameters) if place.endswith("axes") else _along_one(score, parameters)
-        return sorted(found, key=lambda seed: -seed.chi2)
+        search = {"axes": _along_three_axes, "turned": _along_turned_axes, "oblique": _along_one}
+        return sorted(search[place.partition("/")[2]](score, parameters), key=lambda seed: -seed.chi2)
 
     def extended_models(self, score: Score, one: ActiveEffect) -> list[tuple[str, tuple[float, ...]]]:
         """From a fit along one direction: three axes, of which the nearest keeps its frequency; along the others, a
-        resonance is searched at each frequency, anywhere on the line of action. From three axes: turned ones."""
-        if one.place.endswith("axes"):
-            return [("payload/turned", (*one.values, 0.0, 0.0, 0.0))]
+        resonance is searched at each frequency, anywhere on the line of action."""
         if not one.place.endswith("oblique"):
             return []
         values = one.by_name
@@ -160,10 +155,9 @@ def _along_one(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed
 
 def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
     """Three frequencies at once: all triples at every place of the grid, then refined near the best places."""
-    points, zeta = positions(parameters), 0.05
-    frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
-    G, b = _at_frequencies(score, frequencies, zeta)
-    G, n = G.astype(float), len(frequencies)
+    if "along three axes" in score.kept:  # turned axes start from these
+        return list(score.kept["along three axes"])
+    points, (frequencies, G, b) = positions(parameters), _resonances(score, parameters)
 
     def at(point: np.ndarray) -> tuple[float, float, list[int], np.ndarray]:
         rows = at_points(point[None], "xyz")[0]
@@ -178,9 +172,70 @@ def _along_three_axes(score: Score, parameters: Sequence[EffectParameter]) -> li
             best = max(best, at(near[_best_point(G, b, at_points(near, "xyz"), best[2])]), key=lambda one: one[0])
         chi2, mass, triple, point = best
         if mass > 0:
-            values = (min(mass, 0.5 * parameters[0].high), *frequencies[triple], zeta, *point)
-            found.append(Seed(tuple(map(float, values)), chi2, 8, n**3))
+            values = _values(mass, frequencies[triple], point, parameters)
+            found.append(Seed(values, chi2, 8, len(frequencies) ** 3))
+    score.kept["along three axes"] = tuple(found)
     return found
+
+
+def _along_turned_axes(score: Score, parameters: Sequence[EffectParameter]) -> list[Seed]:
+    """All triples of frequencies and rotations of the axes, at the best places found along x, y and z; then places and
+    rotations on finer grids in turn."""
+    frequencies, G, b = _resonances(score, parameters)
+    grid, found = np.linspace(-SETTINGS.most_turned, SETTINGS.most_turned, SETTINGS.turns), []
+    turns, step = _triples(grid), _triples((grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]))
+    # Of any three axes, some permutation is within this angle.
+    turns = turns[np.linalg.norm(turns, axis=1) <= SETTINGS.most_turned]
+    for seed in sorted(_along_three_axes(score, parameters), key=lambda one: -one.chi2)[: SETTINGS.turned_places]:
+        point = np.array(seed.values[5:])
+        chi2, mass, triple, turn = _best_turn(G, b, point, turns)
+        for halving in range(1, SETTINGS.halvings + 1):
+            near = about(point, 0.5**halving)
+            axes = _turned(turn) @ at_points(near, "xyz", oblique=True)
+            point = near[_best_point(G, b, axes, triple)]
+            chi2, mass, triple, turn = _best_turn(G, b, point, turn + 0.5**halving * step)
+        if mass > 0:
+            values = (*_values(mass, frequencies[triple], point, parameters), *map(float, turn))
+            found.append(Seed(values, chi2, 11, len(turns) * len(frequencies) ** 3))
+    return found
+
+
+def _best_turn(
+    G: np.ndarray, b: np.ndarray, point: np.ndarray, turns: np.ndarray
+) -> tuple[float, float, list[int], np.ndarray]:
+    """(chi2, mass, frequency index along each axis, rotation vector (3,)) of the best of the rotations (n, 3)."""
+    rows = at_points(point[None], "xyz", oblique=True)[0]
+    own, along = _at_place(G, rows), b @ rows.T
+    every = [(*_best_triple(_at_place(own, V), along @ V.T), turn) for turn in turns for V in [_turned(turn)]]
+    return max(every, key=lambda one: one[0])
+
+
+def _turned(turn: np.ndarray) -> np.ndarray:
+    """(3, 6) stiffness along each rotated axis, in terms of those along x, y, z, and between xy, xz, yz."""
+    d = Rotation.from_rotvec(turn).as_matrix().T
+    return np.concatenate([d**2, d[:, [0, 0, 1]] * d[:, [1, 2, 2]]], axis=1)
+
+
+def _values(
+    mass: float, frequencies: np.ndarray, point: np.ndarray, parameters: Sequence[EffectParameter]
+) -> tuple[float, ...]:
+    """Starting values of a mass along three axes, without rotation."""
+    return tuple(map(float, (min(mass, 0.5 * parameters[0].high), *frequencies, SETTINGS.axes_damping, *point)))
+
+
+def _triples(values: np.ndarray) -> np.ndarray:
+    """(n^3, 3) all triples of n values."""
+    return np.stack(np.meshgrid(values, values, values, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _resonances(score: Score, parameters: Sequence[EffectParameter]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) frequencies of a sprung mass that are searched along each of three axes, and `_at_frequencies`."""
+    if "three axes" not in score.kept:
+        frequencies = np.array([f for f in sorted({*parameters[1].grid, *peaks(score)}) if f > 2.0])
+        G, b = _at_frequencies(score, frequencies, SETTINGS.axes_damping)
+        score.kept["three axes"] = frequencies, G.astype(float), b
+    frequencies, G, b = score.kept["three axes"]
+    return frequencies, G, b
 
 
 def _along_the_others(
@@ -213,9 +268,10 @@ def _at_frequencies(
 
 
 def _at_place(G: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """(n, k, n, k) Gram matrix of a mass at one place, moving along k axes; G as of `_at_frequencies`, rows (k, 21)."""
-    n, k, own = len(G), len(rows), rows.astype(G.dtype)  # otherwise G, which is large, would be copied
-    return ((own @ G.reshape(n, 21, -1)).reshape(n, k, n, 21) @ own.T).astype(float)
+    """(n, k, n, k) Gram matrix of a mass at one place, moving along k axes; G (n, m, n, m) as of `_at_frequencies`,
+    rows (k, m)."""
+    n, m, k, own = *G.shape[:2], len(rows), rows.astype(G.dtype)  # otherwise G, which is large, would be copied
+    return ((own @ G.reshape(n, m, -1)).reshape(n, k, n, m) @ own.T).astype(float)
 
 
 def _best_triple(G: np.ndarray, b: np.ndarray) -> tuple[float, float, list[int]]:
