@@ -36,9 +36,9 @@ from avis_ctrl.gap.search import (
 )
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import levels, named, time_residuals
-from avis_ctrl.gap.table_model import TableModel
+from avis_ctrl.gap.table_model import ActiveEffect, TableModel
 from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
-from avis_ctrl.gap.validation import Power, halves, share_of
+from avis_ctrl.gap.validation import Power, change_from, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
@@ -240,6 +240,13 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
             for step in remaining
             if step not in kept
         }
+        for step in kept:
+            if change := _bent(best, fits.best, step.label, settings):
+                refused[step.label] = (
+                    f"{name_of(step.label)[0]} is not named: without the effects that are refused, its parameters "
+                    f"differ by {100 * change:.0f} %"
+                )
+                best = without_effect(best, step.label, data, settings) or best
     named = {label: value for label, value in probability.items() if label in best.labels}
     return Names(best, named, {label: rivals[label] for label in named}, refused)
 
@@ -255,12 +262,23 @@ def _refusal(best: Fitted, step: Step, probability: float, data: Data, held: Dat
         return reason
     if not _borne_out(best, step, data, held, settings):
         return "held-out records are not more likely with it"
-    # Halves of the data must agree on all parameters except those that may end at their bounds.
-    constant = [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
-    for half in halves(best, constant, settings, absent=one.absent):
+    for half in halves(best, _constant(one), settings, absent=one.absent):
         if half.change > settings.law_change:
             return f"for {half.words} alone, its parameters differ by {100 * half.change:.0f} % or more"
     return ""
+
+
+def _constant(one: ActiveEffect) -> list[str]:
+    """Parameters on which halves of the data must agree: all except those that may end at their bounds."""
+    return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
+
+
+def _bent(fitted: Fitted, whole: Fitted, label: str, settings: GapSettings) -> float:
+    """Relative change of an effect's parameters from the fit with the effects that are refused; 0 if it is small. A
+    parameter that changes describes the refused effects in their absence."""
+    one = fitted.model.effect(label)
+    change = change_from(fitted, whole, _constant(one), settings, one.absent)
+    return change if change > settings.law_change else 0.0
 
 
 def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSettings) -> bool:

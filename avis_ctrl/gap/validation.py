@@ -78,11 +78,7 @@ def halves(
         compared with the effect's own contribution.
     """
     rows = [fitted.priors.names.index(name) for name in names if name in fitted.priors.names]
-    slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
     root = np.linalg.cholesky(fitted.covariance[np.ix_(rows, rows)])
-    absent = absent or {}
-    effect = _departure(fitted, absent)
-    away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
     found, whole = [], fitted.J
     for words, at in _parts(fitted, rows) if parts is None else parts:
         J, e = whole[:, at], fitted.e[at]
@@ -95,14 +91,45 @@ def halves(
         into, along = root @ V[:, known], (V.T @ step)[known]
         chi2 = float(np.sum(along**2 / (size[known] - 1)))
         difference, variance = into @ along, into**2 @ (size[known] - 1)
-        p = np.minimum(len(rows) * stats.chi2.sf(difference**2 / np.maximum(variance, 1e-300), 1), 1.0)
-        change = np.abs(difference * slope) / np.maximum(away, 1e-300)
-        largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
-        if len(effect):
-            moved, own = difference @ J[rows], effect @ J
-            largest = min(largest, float(np.linalg.norm(moved)) / max(float(np.linalg.norm(own)), 1e-300))
-        found.append(Half(words, chi2, max(int(known.sum()), 1), largest))
+        change = _change(fitted, rows, difference, variance, J, absent or {}, settings)
+        found.append(Half(words, chi2, max(int(known.sum()), 1), change))
     return found
+
+
+def change_from(
+    fitted: Fitted, other: Fitted, names: Sequence[str], settings: GapSettings, absent: Mapping[str, float]
+) -> float:
+    """Relative change of an effect's parameters from their values in another fit, as `Half.change`.
+
+    A parameter that depends on whether other effects are in the model describes these effects, not its own.
+    """
+    rows, others = (
+        [one.priors.names.index(name) for name in names if name in one.priors.names] for one in (fitted, other)
+    )
+    difference, variance = other.z[others] - fitted.z[rows], np.diag(fitted.covariance)[rows]
+    return _change(fitted, rows, difference, variance, fitted.J, absent, settings)
+
+
+def _change(
+    fitted: Fitted,
+    rows: Sequence[int],
+    difference: np.ndarray,
+    variance: np.ndarray,
+    J: np.ndarray,
+    absent: Mapping[str, float],
+    settings: GapSettings,
+) -> float:
+    """`Half.change` of standardised parameters (n,) with a difference and its variance; J : (all parameters, N)."""
+    slope, values = fitted.priors.slopes(fitted.z)[rows], fitted.priors.values(fitted.z)[rows]
+    away = np.abs(values - [absent.get(fitted.priors.names[row], 0.0) for row in rows])
+    p = np.minimum(len(rows) * stats.chi2.sf(difference**2 / np.maximum(variance, 1e-300), 1), 1.0)
+    change = np.abs(difference * slope) / np.maximum(away, 1e-300)
+    largest = float(change.max(initial=0.0, where=p < settings.law_p_value))
+    effect = _departure(fitted, absent)
+    if len(effect):
+        moved, own = difference @ J[rows], effect @ J
+        largest = min(largest, float(np.linalg.norm(moved)) / max(float(np.linalg.norm(own)), 1e-300))
+    return largest
 
 
 def _departure(fitted: Fitted, absent: Mapping[str, float]) -> np.ndarray:

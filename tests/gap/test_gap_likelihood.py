@@ -20,7 +20,7 @@ from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effec
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
-from avis_ctrl.gap.validation import by_information, halves
+from avis_ctrl.gap.validation import by_information, change_from, halves
 from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
 from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
@@ -433,6 +433,28 @@ def test_a_gain_moves_relative_to_its_departure():
     found = SimpleNamespace(priors=wide, z=z, covariance=P, J=J, e=(y - x) / std - J.T @ z, rows={})
     (half,) = halves(found, ("gain",), GapSettings(), [("first", np.arange(200))], {"gain": 1.0})
     assert half.change == pytest.approx(1.0, abs=0.15)
+
+
+def test_an_effect_that_describes_another_one_changes_without_it():
+    """y = a x1 + b x2 with correlated x1, x2: without b, a takes its place; without an unrelated c, it stays."""
+    rng, std = np.random.default_rng(5), 1e-2
+    x = rng.standard_normal((3, 400))
+    x[1] += 0.8 * x[0]
+    x[2] -= np.linalg.lstsq(x[:2].T, x[2], rcond=None)[0] @ x[:2]
+    y = np.array([0.05, 1.0, 0.7]) @ x + std * rng.standard_normal(400)
+    names = ("a", "b", "c")
+
+    def least_squares(rows):
+        wide = Priors(
+            tuple(names[k] for k in rows), np.zeros(len(rows)), np.full(len(rows), 1e3), np.zeros(len(rows), bool)
+        )
+        J = x[rows] * 1e3 / std
+        P = np.linalg.inv(J @ J.T + np.eye(len(rows)))
+        return SimpleNamespace(priors=wide, z=P @ J @ (y / std), covariance=P, J=J)
+
+    whole, settings = least_squares([0, 1, 2]), GapSettings()
+    assert change_from(least_squares([0, 2]), whole, ("a",), settings, {"a": 0.0}) > 0.8
+    assert change_from(least_squares([0, 1]), whole, ("a",), settings, {"a": 0.0}) == 0.0
 
 
 def test_standard_deviations_cover_what_octaves_differ_by():
