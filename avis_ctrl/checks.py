@@ -18,6 +18,11 @@ def is_number(value: object) -> bool:
     )
 
 
+def is_whole(value: object, least: float = -np.inf) -> bool:
+    """Whether a value is an integer of at least `least`."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= least)
+
+
 def require(value: float, field: str, low: float = 0.0, high: float = np.inf) -> None:
     """Raise InputError naming the field unless the value is finite and low < value < high."""
     if not (is_number(value) and low < value < high):
@@ -37,7 +42,7 @@ def require_positive(value: float, field: str, *, zero_allowed: bool = False) ->
 
 def require_whole(value: int, field: str, least: int) -> None:
     """Raise InputError naming the field unless the value is an integer of at least `least`."""
-    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < least:
+    if not is_whole(value, least):
         raise InputError(f"expected a whole number, {least} or more", field=field, value=value)
 
 

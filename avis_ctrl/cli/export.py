@@ -45,6 +45,7 @@ def export(
     certificate.json into DIR. The certificate is computed from the numbers in controller.json (docs/export.md).
     """
     from avis_ctrl import plot
+    from avis_ctrl.checks import require_whole
     from avis_ctrl.errors import InputError
     from avis_ctrl.export.design_folder import open_design
     from avis_ctrl.export.fewer_states import mu_asked, with_fewer_states
@@ -58,8 +59,8 @@ def export(
     for option, value in (("--order", order), ("--format", formats), ("--float32", float32 or None)):
         if check and value is not None:
             raise InputError(f"--check writes no files; expected either --check or {option}", field=option, value=value)
-    if order is not None and order < 1:
-        raise InputError("expected a whole number, 1 or more", field="--order", value=order)
+    if order is not None:
+        require_whole(order, "--order", 1)
     if mu_at_most is not None and not (order is not None and mu_at_most > 0):
         raise InputError(
             "expected a positive number, and only together with --order", field="--mu-at-most", value=mu_at_most

@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg as la
 from numpy.typing import ArrayLike
 
+from avis_ctrl.checks import is_whole
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.interconnection import (
     Quadruple,
@@ -405,7 +406,7 @@ class StateSpace:
 
 def to_power(system: Any, power: int, identity: Any) -> Any:
     """Whole power of a square system. Raises InputError for another power, and the errors of `inverse`."""
-    if isinstance(power, bool) or not isinstance(power, (int, np.integer)):
+    if not is_whole(power):
         raise InputError("expected a whole number", field="power", value=power)
     base = system if power >= 0 else system.inverse()
     result = base if power else identity

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from avis_ctrl.checks import is_whole
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, balance, minimal
 from avis_ctrl.lti.bilinear import continuous_image
@@ -122,7 +123,7 @@ def _order(field: str, given: Signals, names: Names, kind: str, what: str) -> tu
         every, count = [k for k in every if k not in last] + last, len(last)
         if len(set(last)) != count:
             raise InputError("expected different names", field=field, value=given)
-    if isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 1:
+    if not is_whole(count, 1):
         raise InputError("expected a whole number of at least 1, or names", field=field, value=given)
     if count >= total:
         raise InputError(

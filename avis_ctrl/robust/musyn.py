@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from avis_ctrl.checks import require_whole
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.lti.bilinear import continuous_image, sampled_image
@@ -171,8 +172,8 @@ def musyn(
         raise InputError(
             "a decentralised controller has as many outputs as inputs", field="nmeas, ncon", value=(nmeas, ncon)
         )
-    if order is not None and (isinstance(order, bool) or not isinstance(order, (int, np.integer)) or order < 0):
-        raise InputError("expected a whole number of at least 0, or None", field="order", value=order)
+    if order is not None:
+        require_whole(order, "order", 0)
     options = Options(target, max_iterations, backoff, polish, max_added_states, callback)
     made = dk_iteration(P, blocks, nmeas, ncon, options, starts, state)
     with threadpool_limits(1, user_api="blas"):

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from avis_ctrl.checks import require_whole
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti import StateSpace, hinf_norm, lft_lower
 from avis_ctrl.robust.dstep import SETTINGS as D_STEP
@@ -81,8 +82,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.target is not None and not (np.isfinite(self.target) and self.target > 0):
             raise InputError("expected a positive number or None", field="target", value=self.target)
-        if int(self.max_iterations) != self.max_iterations or self.max_iterations < 1:
-            raise InputError("expected a whole number of at least 1", field="max_iterations", value=self.max_iterations)
+        require_whole(self.max_iterations, "max_iterations", 1)
         if not (np.isfinite(self.backoff) and 0 <= self.backoff < 1):
             raise InputError("expected a number from 0 to below 1", field="backoff", value=self.backoff)
         if self.max_added_states is not None and self.max_added_states < 0:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import require_whole
 from avis_ctrl.errors import ComputationError, InputError
 from avis_ctrl.lti.statespace import gain
 from avis_ctrl.measurement.campaign import FLOOR_NAMES, Campaign, Record, RecordHeader
@@ -95,8 +96,7 @@ def simulate_campaign(
         multisine record shorter than two periods, no ambient motion in plan or rig, no sensors.
     ComputationError : the table goes beyond its stops.
     """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise InputError("expected a whole number, 0 or more", field="seed", value=seed)
+    require_whole(seed, "seed", 0)
     if plan.effect and change is None:
         raise InputError(
             "expected what the effects of the plan add to the signals, as by study.hidden_effects", field="change"

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from avis_ctrl.checks import is_whole
 from avis_ctrl.errors import InputError
 
 Kind = Literal["real", "complex", "full"]
@@ -28,7 +29,7 @@ class Block:
 
     def __post_init__(self) -> None:
         for label, size in (("rows", self.rows), ("cols", self.cols)):
-            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 1:
+            if not is_whole(size, 1):
                 raise InputError("a block needs a whole number of at least 1", field=label, value=size)
 
     @property

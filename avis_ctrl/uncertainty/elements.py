@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from avis_ctrl.checks import is_whole
 from avis_ctrl.errors import InputError
 from avis_ctrl.uncertainty.blocks import Block, ComplexFull, ComplexScalar, RealScalar
 
@@ -148,7 +149,7 @@ class Dynamics(Element):
     def __post_init__(self) -> None:
         super().__post_init__()
         for field in ("rows", "cols"):
-            if not isinstance(getattr(self, field), int) or getattr(self, field) < 1:
+            if not is_whole(getattr(self, field), 1):
                 raise InputError(
                     "expected whole numbers of at least 1", field=f"{self.name}: shape", value=(self.rows, self.cols)
                 )
