@@ -241,10 +241,10 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
             if step not in kept
         }
         for step in kept:
-            if change := _bent(best, fits.best, step.label, settings):
+            if change := _change_if_weak(best, fits.best, step.label, settings):
                 refused[step.label] = (
-                    f"{name_of(step.label)[0]} is not named: without the effects that are refused, its parameters "
-                    f"differ by {100 * change:.0f} %"
+                    f"{name_of(step.label)[0]} is not named: beside the effects that are refused, its strength is hardly "
+                    f"distinguishable from zero, and without them its parameters differ by {100 * change:.0f} %"
                 )
                 best = without_effect(best, step.label, data, settings) or best
     named = {label: value for label, value in probability.items() if label in best.labels}
@@ -273,9 +273,11 @@ def _constant(one: ActiveEffect) -> list[str]:
     return [name for name, p in zip(one.names, one.parameters, strict=True) if p.linear or not p.optional]
 
 
-def _bent(fitted: Fitted, whole: Fitted, label: str, settings: GapSettings) -> float:
-    """Relative change of an effect's parameters from the fit with the effects that are refused; 0 if it is small. A
-    parameter that changes describes the refused effects in their absence."""
+def _change_if_weak(fitted: Fitted, whole: Fitted, label: str, settings: GapSettings) -> float:
+    """Relative change of a weak effect's parameters from the fit with the effects that are refused; 0 if it is small,
+    or if the effect is strong beside them. A weak effect that changes describes the refused ones in their absence."""
+    if not is_weak(whole, label, settings):
+        return 0.0
     one = fitted.model.effect(label)
     change = change_from(fitted, whole, _constant(one), settings, one.absent)
     return change if change > settings.law_change else 0.0
