@@ -243,8 +243,8 @@ def _names(fits: Fits, prepared: Prepared) -> Names:
         for step in kept:
             if change := _change_if_weak(best, fits.best, step.label, settings):
                 refused[step.label] = (
-                    f"{name_of(step.label)[0]} is not named: beside the effects that are refused, its strength is hardly "
-                    f"distinguishable from zero, and without them its parameters differ by {100 * change:.0f} %"
+                    f"{name_of(step.label)[0]} is not named: beside the effects that are refused, its strength is "
+                    f"hardly distinguishable from zero, and without them its parameters differ by {100 * change:.0f} %"
                 )
                 best = without_effect(best, step.label, data, settings) or best
     named = {label: value for label, value in probability.items() if label in best.labels}
