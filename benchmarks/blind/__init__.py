@@ -4,4 +4,5 @@
     python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.png]
 
 Both from the root of the repository. The first takes hours and may be killed and resumed; the second only reads.
+`seed_91000.jsonl.gz` has the lines behind the table in docs/gap_engine.md.
 """

@@ -50,9 +50,13 @@ def figures(cases: Sequence[Judged]) -> list[tuple[str, ...]]:
             "97 %",
             "90 %",
         ),
+        (
+            "one effect, clear or gross: named first, or listed as a trace",
+            fraction(named_first(case) or all_listed(case) for case in one if case.line.clear),
+        ),
         ("right place, where the effect has one and its name is right", str(right_places(cases)), "97 %", "90 %"),
         ("two effects: both named", fraction(map(both_named, two)), "85 %", "70 %"),
-        ("two effects: both named, as effects or as traces", fraction(map(both_listed, two))),
+        ("two effects: both named, as effects or as traces", fraction(map(all_listed, two))),
         ("two effects, each clear or gross: both named", fraction(both_named(case) for case in two if case.line.clear)),
         (
             "outside the library: named as something else",
@@ -89,10 +93,10 @@ def both_named(case: Judged) -> bool:
     return len(case.pairs) == 2
 
 
-def both_listed(case: Judged) -> bool:
-    """Both hidden effects are listed, one of them perhaps as a trace, because it explains little of the gap."""
-    answer = case.line.answer
-    return answer is not None and len(matches(case.line.hidden, [*answer.effects, *answer.traces])) == 2
+def all_listed(case: Judged) -> bool:
+    """All hidden effects are listed, perhaps as traces, because they explain little of the gap."""
+    answer, hidden = case.line.answer, case.line.hidden
+    return answer is not None and len(matches(hidden, [*answer.effects, *answer.traces])) == len(hidden)
 
 
 def closes_the_gap(case: Judged) -> bool:

@@ -5,7 +5,9 @@ One JSON object per line and case. The runner writes them, the scorer reads them
 
 from __future__ import annotations
 
+import gzip
 import json
+import zlib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -247,9 +249,10 @@ def read_lines(path: str | Path) -> list[Line]:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "is not UTF-8 text"
+        content = path.read_bytes()
+        return (gzip.decompress(content) if path.suffix == ".gz" else content).decode("utf-8")
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or "is not UTF-8 text, or gzipped text"
         raise InputError(f"expected a readable file of JSON lines: {reason}", file=path) from None
 
 

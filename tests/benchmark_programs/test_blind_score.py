@@ -1,5 +1,6 @@
 """The score of blind campaigns: hand-made lines whose figures are known by hand."""
 
+import gzip
 import json
 import sys
 from math import log
@@ -269,10 +270,14 @@ def test_a_second_effect_that_explains_little_may_be_listed_as_a_trace():
     lines = [
         line(0, "two", [lag, corner], answer("explained", first, traces=[second])),
         line(1, "two", [lag, corner], answer("explained", first)),
+        line(2, "one", [corner], answer("explained", first, traces=[second])),
+        line(3, "one", [corner], answer("explained", first)),
     ]
     found = {row[0]: row[1] for row in asked_table(list(map(judge, lines))).rows}
     assert found["two effects: both named"].startswith("0.0 % (0/2;")
     assert found["two effects: both named, as effects or as traces"].startswith("50.0 % (1/2;")
+    assert found["one effect, clear or gross: named first"].startswith("0.0 % (0/2;")
+    assert found["one effect, clear or gross: named first, or listed as a trace"].startswith("50.0 % (1/2;")
 
 
 @pytest.mark.parametrize(
@@ -448,11 +453,19 @@ def test_files_that_cannot_be_read(tmp_path, capsys):
         with pytest.raises(InputError, match="readable file"):
             read_lines(path)
     (tmp_path / "bytes").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="UTF-8"):
-        read_lines(tmp_path / "bytes")
+    (tmp_path / "bytes.gz").write_bytes(b"\xff\xfe\x00")
+    for name in ("bytes", "bytes.gz"):
+        with pytest.raises(InputError, match="UTF-8"):
+            read_lines(tmp_path / name)
     with pytest.raises(SystemExit) as caught:
         main([str(tmp_path / "absent")])
     assert caught.value.code == 2 and "Traceback" not in capsys.readouterr().err
+
+
+def test_lines_may_be_gzipped(tmp_path):
+    path = write(tmp_path / "b.jsonl", GOOD)
+    (tmp_path / "b.jsonl.gz").write_bytes(gzip.compress(path.read_bytes()))
+    assert read_lines(tmp_path / "b.jsonl.gz") == read_lines(path)
 
 
 def test_an_unfinished_last_line_is_cut(tmp_path):
