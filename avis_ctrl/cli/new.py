@@ -199,7 +199,7 @@ def design(
     read_study(out)
     low, high = made.transmissibility.band_Hz
     print(
-        f"{out}: written; the table has to isolate from {low:g} to {high:g} Hz.\n"
+        f"{out}: written. Isolation is required from {low:g} to {high:g} Hz.\n"
         f'Next: replace the values marked "Assumed", then run avis design {out} --out {out.with_suffix("")}'
     )
 

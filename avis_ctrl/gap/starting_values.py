@@ -38,8 +38,8 @@ class StartSettings:
     followed_places : number of places at which three frequencies are searched on a finer grid, the best first.
     turned_places : number of these places at which rotated axes are searched.
     axes_damping : damping ratio of the search of three frequencies [1].
-    most_turned, turns : largest rotation of the axes that is searched [rad], to which any three orthogonal axes can be
-        brought by permutation, and number of steps about each axis.
+    turned_rad : largest rotation of the axes [rad], and number of rotations about each axis searched: any three
+        orthogonal axes are within this rotation of some permutation of x, y and z.
     narrowest : minimum damping ratio for the frequency grid of a sprung mass, or of a chassis around a fit [1]; a
         smaller one would need more frequencies than a search can afford.
     stiff_Hz : frequency of a sprung mass along an axis in which it shows no resonance [Hz]: above the band.
@@ -84,8 +84,7 @@ class StartSettings:
     followed_places: int = 6
     turned_places: int = 2
     axes_damping: float = 0.05
-    most_turned: float = 1.1
-    turns: int = 9
+    turned_rad: tuple[float, int] = (1.1, 9)
     narrowest: float = 0.02
     stiff_Hz: float = 150.0
     mode_Hz: tuple[float, float, int] = (7.0, 140.0, 22)

@@ -101,7 +101,7 @@ def change_from(
 ) -> float:
     """Relative change of an effect's parameters from their values in another fit, as `Half.change`.
 
-    A parameter that depends on whether other effects are in the model describes these effects, not its own.
+    A parameter that changes when other effects are left out describes them in their absence.
     """
     rows, others = (
         [one.priors.names.index(name) for name in names if name in one.priors.names] for one in (fitted, other)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.signal as signal
 
-from avis_ctrl.checks import places, require, require_positive
+from avis_ctrl.checks import is_whole, places, require, require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.measurement.campaign import Record
 from avis_ctrl.rigs.rig import Rig
@@ -92,7 +92,7 @@ def prefilter(
     """
     rate = record.header.sample_rate_Hz
     at_rest = int(np.count_nonzero(inverse.poles == 0))
-    if not (isinstance(order, int) and at_rest < order <= 12):
+    if not (is_whole(order, at_rest + 1) and order <= 12):
         raise InputError(f"expected a whole number from {at_rest + 1} to 12", field="highpass_order", value=order)
     require(corner_Hz, "highpass_Hz", 0, rate / 2)
     require_positive(delay_s, "loop_delay_s", zero_allowed=True)

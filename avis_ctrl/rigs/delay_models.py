@@ -7,7 +7,7 @@ from math import comb, factorial
 import numpy as np
 import scipy.linalg as la
 
-from avis_ctrl.checks import require_positive
+from avis_ctrl.checks import is_whole, require_positive
 from avis_ctrl.errors import InputError
 from avis_ctrl.lti.statespace import StateSpace, gain, tf
 
@@ -17,7 +17,7 @@ def pade_coefficients(order: int) -> np.ndarray:
 
     Raises InputError for an order outside 1..10.
     """
-    if not (isinstance(order, int) and 1 <= order <= 10):
+    if not (is_whole(order, 1) and order <= 10):
         raise InputError("a whole number from 1 to 10", field="pade_order", value=order)
     return np.array([comb(order, k) * factorial(2 * order - k) / factorial(2 * order) for k in range(order, -1, -1)])
 

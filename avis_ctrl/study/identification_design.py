@@ -178,12 +178,17 @@ def default_design(rig: Rig, title: str, parameters_percent: Mapping[str, float]
 
     parameters_percent : ranges of the rig's parameters; by default none, because an identification provides them.
     """
-    shape = _AVIS if isinstance(rig, IsolatorTable) else _HALCYONICS
+    shape = _shape(rig)
     uncertainty = shape["uncertainty"] | {"parameters_percent": dict(parameters_percent or {})}
     # A quarter of the sample rate: the hold distorts faster poles.
     fastest = {"quantity": "fastest_controller_pole_Hz", "at_most": rig.sample_rate_Hz / 4}
     own = {"title": title, "rig": RIG_FILE, "keep": default_keep(rig), "uncertainty": uncertainty}
     return design_from_table(shape | own | {"requirement": [*shape["requirement"], fastest]})
+
+
+def _shape(rig: Rig) -> dict[str, Any]:
+    """Keys of the shipped design for this kind of table."""
+    return _AVIS if isinstance(rig, IsolatorTable) else _HALCYONICS
 
 
 def _shipped(rig: Rig) -> Rig:
@@ -193,10 +198,11 @@ def _shipped(rig: Rig) -> Rig:
 
 def default_band(rig: Rig) -> tuple[float, float]:
     """Band of isolation [Hz] of the shipped design, scaled by the geometric mean of the natural frequencies."""
-    shape = _AVIS if isinstance(rig, IsolatorTable) else _HALCYONICS
-    low, high = (gmean(one.equations_of_motion().natural_frequencies().frequencies_Hz) for one in (_shipped(rig), rig))
-    first, last = (float(f"{f * high / low:.2g}") for f in shape["transmissibility"]["band_Hz"])
-    return first, last
+    shipped, own = (
+        gmean(one.equations_of_motion().natural_frequencies().frequencies_Hz) for one in (_shipped(rig), rig)
+    )
+    low, high = (float(f"{f * own / shipped:.2g}") for f in _shape(rig)["transmissibility"]["band_Hz"])
+    return low, high
 
 
 def assumed_weights(rig: Rig) -> str:

@@ -38,9 +38,9 @@ class RecordPlausibility:
     gain_decades : gain errors that are tried. rig_factors : errors of the rig's parameters that are tried.
     coherent : multiple coherence from which the power of a band counts as response to the drives.
     records, samples, lines : maximum numbers used, for speed. octaves : width of a band.
-    least_bands : a sensor is compared if it responds to the drives in this number of bands (in all that are driven, if
-        these are fewer), because a unit error acts in all of them. Where most of the response is incoherent, as
-        with two clocks that differ, the level in the rest of the bands is no measure of a unit.
+    least_bands : minimum number of bands in which a sensor must respond to the drives for a comparison (all driven
+        bands, if there are fewer): a unit error acts in all of them. If most of the response is incoherent, as with two
+        clocks that differ, the level in the remaining bands is no evidence of a unit.
     hopeless : distance above which records are refused even if no single error explains them: a factor of about 30.
     rare : penalty added to the distance for an error other than three decades. scope : penalty for an error other than
         a common gain; half of it for a single channel, so that the simplest of similar errors is named.

@@ -11,7 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from avis_ctrl.gap.effects.base import SETTINGS as LIBRARY
 from avis_ctrl.gap.effects.base import EffectParameter, Reported, Table, Values, register
-from avis_ctrl.gap.effects.impedance import about, at_points, peaks, positions, project, unit_matrices
+from avis_ctrl.gap.effects.impedance import (
+    about,
+    at_points,
+    grid_points,
+    peaks,
+    positions,
+    project,
+    springs_along,
+    unit_matrices,
+)
 from avis_ctrl.gap.effects.line_of_action import along, best_direction, foot, reported_line
 from avis_ctrl.gap.effects.payload import AtPoint, place_of
 from avis_ctrl.gap.effects.sensors import second_order, sprung
@@ -182,10 +191,10 @@ def _along_turned_axes(score: Score, parameters: Sequence[EffectParameter]) -> l
     """All triples of frequencies and rotations of the axes, at the best places found along x, y and z; then places and
     rotations on finer grids in turn."""
     frequencies, G, b = _resonances(score, parameters)
-    grid, found = np.linspace(-SETTINGS.most_turned, SETTINGS.most_turned, SETTINGS.turns), []
-    turns, step = _triples(grid), _triples((grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]))
-    # Of any three axes, some permutation is within this angle.
-    turns = turns[np.linalg.norm(turns, axis=1) <= SETTINGS.most_turned]
+    (most, count), found = SETTINGS.turned_rad, []
+    grid = np.linspace(-most, most, count)
+    turns, near = grid_points(grid, grid, grid), (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0])
+    turns, step = turns[np.linalg.norm(turns, axis=1) <= most], grid_points(near, near, near)
     for seed in sorted(_along_three_axes(score, parameters), key=lambda one: -one.chi2)[: SETTINGS.turned_places]:
         point = np.array(seed.values[5:])
         chi2, mass, triple, turn = _best_turn(G, b, point, turns)
@@ -211,9 +220,8 @@ def _best_turn(
 
 
 def _turned(turn: np.ndarray) -> np.ndarray:
-    """(3, 6) stiffness along each rotated axis, in terms of those along x, y, z, and between xy, xz, yz."""
-    d = Rotation.from_rotvec(turn).as_matrix().T
-    return np.concatenate([d**2, d[:, [0, 0, 1]] * d[:, [1, 2, 2]]], axis=1)
+    """(3, 6) `springs_along` axes rotated by the vector `turn` (3,)."""
+    return springs_along(Rotation.from_rotvec(turn).as_matrix().T)
 
 
 def _values(
@@ -221,11 +229,6 @@ def _values(
 ) -> tuple[float, ...]:
     """Starting values of a mass along three axes, without rotation."""
     return tuple(map(float, (min(mass, 0.5 * parameters[0].high), *frequencies, SETTINGS.axes_damping, *point)))
-
-
-def _triples(values: np.ndarray) -> np.ndarray:
-    """(n^3, 3) all triples of n values."""
-    return np.stack(np.meshgrid(values, values, values, indexing="ij"), -1).reshape(-1, 3)
 
 
 def _resonances(score: Score, parameters: Sequence[EffectParameter]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

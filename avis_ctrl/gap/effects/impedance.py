@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
@@ -30,14 +31,19 @@ def positions(parameters: Sequence[EffectParameter]) -> np.ndarray:
     """Grid of places (n, 3) [m]; coordinates without a parameter are zero."""
     free = {one.name for one in parameters}
     axes = [grid if f"{axis}_m" in free else np.zeros(1) for axis, grid in zip("xyz", place_grid(), strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    return grid_points(*axes)
+
+
+def grid_points(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """(n, 3) all points of a grid."""
+    return np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3)
 
 
 def about(point: np.ndarray, share: float) -> np.ndarray:
     """(27, 3) places around a point [m], this fraction of the grid step away along each axis, within the grid."""
     grids = place_grid()
     steps = [share * (grid[1] - grid[0]) * np.array([-1.0, 0.0, 1.0]) for grid in grids]
-    near = point + np.stack(np.meshgrid(*steps, indexing="ij"), -1).reshape(-1, 3)
+    near = point + grid_points(*steps)
     return np.clip(near, [grid[0] for grid in grids], [grid[-1] for grid in grids])
 
 
@@ -46,10 +52,15 @@ def at_points(points: np.ndarray, axes: str, oblique: bool = False) -> np.ndarra
     return _at_points(points.tobytes(), axes, oblique)
 
 
+def springs_along(d: np.ndarray) -> np.ndarray:
+    """(n, 6) unit springs along directions (n, 3), in terms of those of `at_points(.., oblique=True)`."""
+    return np.column_stack([d**2, *(d[:, i] * d[:, j] for i, j in combinations(range(3), 2))])
+
+
 @lru_cache(maxsize=16)
 def _at_points(points: bytes, axes: str, oblique: bool) -> np.ndarray:
     found = []
-    pairs = [("xyz".index(a),) * 2 for a in axes] + ([(0, 1), (0, 2), (1, 2)] if oblique else [])
+    pairs = [("xyz".index(a),) * 2 for a in axes] + (list(combinations(range(3), 2)) if oblique else [])
     for point in np.frombuffer(points).reshape(-1, 3):
         G = point_map(point)
         springs = (np.outer(G[i], G[j]) + (i != j) * np.outer(G[j], G[i]) for i, j in pairs)

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from avis_ctrl.gap.effects.base import Reported, Values
-from avis_ctrl.gap.effects.impedance import at_points
+from avis_ctrl.gap.effects.impedance import at_points, springs_along
 from avis_ctrl.gap.starting_values import SETTINGS
 
 
@@ -34,7 +34,7 @@ def best_direction(G: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[fl
     d = basis @ b
     A = basis @ G @ np.swapaxes(basis, 1, 2)
     every = directions()
-    V = np.column_stack([every**2, *(every[:, i] * every[:, j] for i, j in ((0, 1), (0, 2), (1, 2)))])
+    V = springs_along(every)
     along = d @ V.T
     size = A.reshape(len(A), -1) @ (V[:, :, None] * V[:, None, :]).reshape(len(V), -1).T
     mass = np.where(size > 0, along / np.where(size > 0, size, 1.0), 0.0)
