@@ -57,7 +57,8 @@ def _commands(
 ) -> None:
     """Workbench for active vibration isolation tables.
 
-    Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed, 130 ended by Ctrl-C.
+    Exit codes: 0 done (read the verdict), 2 invalid input, 3 a computation failed or the designed loop is
+    unstable, 130 ended by Ctrl-C.
     """
 
 

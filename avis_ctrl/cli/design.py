@@ -22,7 +22,7 @@ def design(
     Writes report.html, report.pdf, controllers/NAME.json, sampled_controller.json (the controller for the processor,
     sensor volts to drive volts, all axes), study.json (the inputs, for avis export), plant.json and result.json into
     DIR. Ctrl-C after the line "step 0", during the D-K iteration, ends it and continues with the best controller so
-    far; at any other time, and a second time, it ends the command without results (exit code 130).
+    far; at any other time, or if pressed again, it ends the command without results (exit code 130).
 
     The exit code is 3 if the closed loop is unstable for any simulated plant; the first sentence of the output names
     the cause.

@@ -29,7 +29,7 @@ CAMPAIGN: records of the rig: HDF5, .mat, UFF 58 or CSV
     design for z and phi_x
 --effects FILE.py: Python file with effects of your own, run before the search (docs/own_effect.md)
 --despite-gates: continue even if a gate reports a stop
---seed: seed of all random draws
+--seed: recorded in the results; no verdict depends on it
 """)
 
 

@@ -111,7 +111,7 @@ def identify(
             )
         except AvisError as error:
             # The identification is valid without the design files.
-            more, made, then = {}, None, f"; no uncertainty.json and design.toml: {error}"
+            more, made, then = {}, None, f"; uncertainty.json and design.toml were not written: {error}"
         progress("report")
         files = write_identification(found, folder, *rendered(document(found, made)), more)
     _summary(terminal, found)
@@ -120,7 +120,7 @@ def identify(
 
 PREDICT = Options("""
 DIR: output folder of avis identify, avis gap or avis gap-axis
-CAMPAIGN: another campaign of the same rig
+CAMPAIGN: another campaign of the same rig; another record, if DIR is that of avis gap-axis
 --out PRED.h5: file to write
 --effects FILE.py: file with your own effects, if the models of avis gap contain them
 """)
@@ -212,17 +212,15 @@ def _summary(terminal: Terminal, found: Identification) -> None:
     for one in found.campaign_fit.tolerances[:5]:
         said.append(f"{one.parameter}: {text(one.value, one.std, one.unit)}, moved by {one.moved:+.1f} tolerances")
     if found.advice:
-        said.append(
-            f"{found.advice[0]} (The section on identifiability of the report lists other records that would help.)"
-        )
+        said.append(f"{found.advice[0]} (The report's section on identifiability lists other records that would help.)")
     terminal.print(*(f"- {sentence}" for sentence in said))
 
 
 SINGLE_AXIS = Options("""
 KIND: seismometer, decay, drive or oscillator
 MEASUREMENT: a record; for a seismometer a folder with one CSV per frequency
---columns ROLE=NAME,..: seismometer: drive, coil and/or displacement; decay: y; drive: force, position, reference;
-    oscillator: u, y; each also t
+--columns ROLE=NAME,..: seismometer: drive, and coil and/or displacement, or ground (then drive is its velocity);
+    decay: y; drive: force, position, reference; oscillator: u, y; each also t
 --scale ROLE=FACTOR,..: factors to SI units
 --sample-rate: sample rate [Hz], if the file has no time column
 """)
@@ -247,7 +245,7 @@ def single_axis(
 
 # Units that the fits assume for each role, after --scale.
 UNITS = {
-    "seismometer": {"drive": "N (m/s where ground is mapped)", "coil": "V", "displacement": "m", "ground": "V"},
+    "seismometer": {"drive": "N (m/s with ground)", "coil": "V", "displacement": "m", "ground": "V"},
     "decay": {"y": "any unit"},
     "drive": {"force": "N", "position": "m", "reference": "m"},
     "oscillator": {"u": "any unit", "y": "any unit"},

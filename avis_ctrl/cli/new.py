@@ -210,5 +210,5 @@ def _numbers(text: str, count: int, field: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != count:
-        raise InputError(f"expected {count} numbers with commas between them", field=field, value=text)
+        raise InputError(f"expected {count} numbers separated by commas", field=field, value=text)
     return values

@@ -533,9 +533,11 @@ def _remains(residual: Remainder, remaining: Sequence[Where]) -> str:
             f"as a whole the residual does not exceed the noise, but it does in {'; '.join(places[:3])}"
             f"{' and elsewhere' if places[3:] else ''}"
         )
-    level = {True: "; it grows faster than the drives", False: "; it does not grow faster than the drives", None: ""}[
-        residual.grows_with_level
-    ]
+    level = {
+        True: "; it grows faster than the drive level",
+        False: "; it does not grow faster than the drive level",
+        None: "",
+    }[residual.grows_with_level]
     lies = (
         f", most of it in {remaining[0].output} from {remaining[0].from_Hz:.3g} to {remaining[0].to_Hz:.3g} Hz"
         if remaining

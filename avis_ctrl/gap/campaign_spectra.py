@@ -139,7 +139,7 @@ def with_noise(
         like = known[key]
         assert like.noise is not None
         made.append(block.with_noise(like.noise, like.dof))
-    dof, better = f"{made[0].dof:.0f} degrees of freedom per line", "; a record at rest gives a better estimate"
+    dof, better = f"{made[0].dof:.0f} degrees of freedom per line", "; a record at rest would give a better estimate"
     if kinds:
         places = (("in records at rest", rest), ("between the harmonics of periodic records", between))
         where = " and ".join(words for words, found in places if found)

@@ -65,7 +65,7 @@ class ModelFile(Section):
     delay_s: Annotated[float, Field(ge=0, lt=1)]
     amplifier_corner_Hz: Positive | None
     effects: list[EffectFile]
-    fixed: list[str] = []  # from files before 0.5: has no influence on the response
+    fixed: list[str] = []  # from files of version 0.4.0 and earlier: has no influence on the response
     campaign_s: Annotated[list[float], Field(min_length=2, max_length=2)]
 
 

@@ -137,7 +137,7 @@ def grows(records: Sequence[RecordGap]) -> tuple[float, float] | None:
 
 
 def grows_faster(records: Sequence[RecordGap]) -> bool | None:
-    """Whether the residual beyond noise grows faster than the drives; None if the records do not show it."""
+    """Whether the residual beyond noise grows faster than the drive level; None if the records do not show it."""
     growth = grows(records)
     if growth is None:
         return None

@@ -91,7 +91,7 @@ class Operators:
     Attributes
     ----------
     s : (n,) j omega. base : rig, sensors, actuators. mounts : their geometry.
-    stiffness_factor, damping_factor : (n, n_g) complex factors of the mounts' k and c.
+    stiffness_factor, damping_factor : (1 or n, n_g) complex factors of the mounts' k and c.
     internal_omega, internal_damping : (n_g,) rad/s and damping ratio of the resonance of a mass inside each mount,
         infinite without a mass; the mount's own c bypasses the mass. payload_share : (n_g,) fraction of the mount's
         compliance between that mass and the payload.
@@ -99,7 +99,8 @@ class Operators:
     rows : (1 or n, n_y, 6) displacement measured by each sensor. against : (1, n_y, 6) the same of the chassis, which
         is subtracted; zero for inertial sensors. sense : (n, n_y) sensor chain and s^p, without
         sensitivity.
-    sensor_gain : (n_y,) factors. drive : (n, n_u) factors of the volts. delay_s, amplifier_corner_Hz : of the drives.
+    sensor_gain : (n_y,) factors. drive : (1 or n, n_u) factors of the volts. delay_s,
+        amplifier_corner_Hz : of the drives.
     inner : (n, 6, m) forces on q due to unit impulses on internal states of effects. decays : the same for first-order
         states, which need impulses only. ringing : index of a sensor, and (n, m) its output due to unit initial values
         of states that an effect adds to its chain.

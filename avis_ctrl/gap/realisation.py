@@ -47,7 +47,7 @@ _AT_REST = {
     "actuator_saturation": "no effect below its limit: left out",
 }
 _NOTES = {
-    "contact_friction": "without slip: a spring at every motor",
+    "contact_friction": "without slip: a spring at every drive",
     "structural_damping": "a causal ladder of passive branches",
 }
 

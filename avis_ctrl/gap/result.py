@@ -35,7 +35,7 @@ class NamedEffect:
     probability : of this effect among the candidates fitted in its place, given the data, with equal prior
         probabilities within the library; for an effect on the signals alone, the confidence of its detector.
         indistinguishable_from : names of effects that these data cannot distinguish from it.
-    share : increase of the held-out residual power with what the rig file states in place of the effect, over the
+    share : increase of the held-out residual power if the effect is replaced by what the rig file states, over the
         baseline's power in excess of the noise.
     label : of the active effect in the updated model; empty for an effect on the signals alone (hum, converter, ground
         motion). confirmation : a sentence on how it was found.
@@ -109,8 +109,8 @@ class Remainder:
     """Residual of the updated model on held-out records.
 
     nrmse : over y, r.m.s. over_noise : over the residual expected from noise alone. share : power beyond noise over
-        that of the baseline. grows_with_level : whether it grows faster than the drives; None if the records do not
-        show it.
+        that of the baseline. grows_with_level : whether it grows faster than the drive level; None if the records do
+        not show it.
     """
 
     nrmse: float
@@ -154,7 +154,7 @@ class Where:
 class Considered:
     """A candidate that was fitted: held-out chi-square per degree of freedom, and why it was not named.
 
-    probability : odds against the best candidate of the same step, at most `GapSettings.most_sure`. law : of the
+    probability : of this candidate among all fitted in the same step, at most `GapSettings.most_sure`. law : of the
         effect, if it has several.
     """
 
@@ -272,8 +272,8 @@ class Gap(Findings):
         then "mains_hum", if there is any, without the polluted lines, and one for each effect that a model explains.
     where : location of the gap after re-identification. remaining : the same after the named effects.
     noise_nrmse : residual of the held-out records expected from noise alone. next_experiment : None or a sentence.
-    baseline, updated : models (without named effects, updated is the baseline with all values of the rig file fitted
-        within their tolerances).
+    baseline, updated : models (without named effects, updated is the baseline with all values of the rig file
+        fitted with their tolerances as prior standard deviations).
     considered : runners-up. heat : residual over noise by band and channel. sentences : verdict first.
     held_out : the held-out data and the reason for their choice. seed, seconds.
     covariance : (n_p, n_p) of the updated model's parameters.

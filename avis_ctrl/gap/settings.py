@@ -1,4 +1,4 @@
-"""All tuning values of the search for missing effects, with their units, meanings and reasons."""
+"""Tuning values of the search as a whole; those of its parts are the `SETTINGS` of their modules (`tuning_values`)."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class GapSettings(FitSettings):
         imitate a missing effect [1].
     least_spread : smallest credible spread of these values, in tolerances [1]: there are some tens of them, and the
         model has errors of this size.
-    narrow : spread below which outliers from it are searched [1]: an outlier raises the log evidence by half its
-        square over that of the spread.
+    narrow : spread below which outliers are searched for [1]: one of z tolerances raises the log evidence by
+        z^2 / (2 spread^2).
     held : prior standard deviation of a value beyond its tolerance, over the tolerance [1]: the effect alone then
         represents it.
     effect_sizes : prior standard deviation of an effect's strength, in units of its parameter's size; broad, so that it
@@ -73,7 +73,7 @@ class GapSettings(FitSettings):
         [1].
     within_noise : chi-square per degree of freedom up to which the residual counts as noise [1]: a tenth in r.m.s., the
         uncertainty of the noise estimate itself.
-    small : r.m.s. of the residual over the response below which nothing is missing [1] (contract).
+    small : r.m.s. of the residual beyond noise over the response below which nothing is missing [1] (contract).
     explained : fraction of the baseline's excess power that must be removed for a gap to count as explained [1]
         (contract).
     known_noise : chi-square per degree of freedom up to which the residual shows the noise of floor and sensors [1].

@@ -100,7 +100,7 @@ def without_hum(campaign: Campaign, hum: HumFinding, residual: tuple[RecordResid
 
 def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
     """Effects found in the signals, with the names of the contract."""
-    fault = {"resolution": "is coarser than the rig file says", "clipping": "clips below its nominal range"}
+    fault = {"resolution": "is coarser than the rig file states", "clipping": "clips below its nominal range"}
     rows: list[tuple[str, str, str, ConverterFinding | HumFinding | FloorLevel]] = [
         ("sensor_quantisation", one.channel, f"the converter of {one.channel} {fault[one.kind]}", one)
         for one in faults.converter
@@ -109,7 +109,7 @@ def named(faults: SignalFaults, settings: GapSettings) -> list[NamedEffect]:
         where = f"mains hum of {hum.nominal_Hz:g} Hz and harmonics in {', '.join(hum.channels)}"
         rows.append(("mains_hum", "geophones", where, hum))
     if faults.noise and (floor := faults.noise.ground_motion):
-        rows.append(("ground_motion", "floor", "the floor moves more than the rig file says, unmeasured", floor))
+        rows.append(("ground_motion", "floor", "the unmeasured floor motion is larger than the rig file states", floor))
     return [
         NamedEffect(
             name, place, title, one.parameters, min(one.confidence, settings.most_sure), confirmation=one.sentence

@@ -136,6 +136,6 @@ def _with_forces(
         "the forces of " + ", ".join(one.label for one in effects) + " do not converge",
         measured=f"residual of the equation of motion {defect:.2g} of the deflection after "
         f"at most {SETTINGS.most_passes} passes, deflection {size:.3g} m r.m.s.",
-        cause="rotations that are not small, or a force that depends on what comes later",
+        cause="rotations that are not small, or a force that depends on later motion",
         next_step="a lower level, or leave the effect out of the simulation",
     )

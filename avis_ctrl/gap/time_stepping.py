@@ -210,7 +210,7 @@ def _without_bound(effects: Sequence[ActiveEffect], record: RecordMotion, start:
     peak = float(np.max(np.abs(record.deflection[:start]), initial=0.0))
     values = ", ".join(f"{one.label} {one.by_name}" for one in effects)
     return ComputationError(
-        f"the table with {values} finds no motion at {start / record.sample_rate_Hz:.3g} s",
+        f"no motion of the table with {values} satisfies the equations at {start / record.sample_rate_Hz:.3g} s",
         measured=f"up to {peak:.3g} m of deflection before; {SETTINGS.most_iterations} iterations a sample",
         cause="an effect that pushes harder the farther the table moves, or that is far stiffer than a mount",
         next_step="other values of the effect's parameters, or a lower level",

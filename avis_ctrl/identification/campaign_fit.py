@@ -395,7 +395,7 @@ def fit_campaign(
         levels = levels_of(campaign.records)
         begun = begin(turned, without(blocks, added), levels, within, priors or {})
         say(
-            f"fit with {int(np.sum(~begun.flat))} values of the rig file within their tolerances: "
+            f"fit with {int(np.sum(~begun.flat))} values of the rig file free, with their tolerances: "
             f"{begun.fitted.iterations} iterations"
         )
         linear = without(blocks, [one[0] for one in terms(campaign, blocks, begun.fitted.model)])

@@ -117,9 +117,9 @@ ADDITIONS = {  # place, strength, (volts, outputs) that are added to a record of
     "sensor_cubic": ("Sz1", 0.02, lambda u, y, t: (0, only(1, (y[:, 1] - y[:, 1].mean()) ** 3, 6))),
     "drive_crosstalk": ("Ay1/Ax2", 0.3, lambda u, y, t: (only(0, u[:, 2], 8), 0)),
     "drive_quadratic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 2, 8), 0)),
-    "drive_absolute": ("all motors", 0.3, lambda u, y, t: (u * np.abs(u), 0)),
+    "drive_absolute": ("all drives", 0.3, lambda u, y, t: (u * np.abs(u), 0)),
     "drive_cubic": ("Ay1", 0.3, lambda u, y, t: (only(0, u[:, 0] ** 3, 8), 0)),
-    "force_drift": ("all motors", 0.3, lambda u, y, t: (u * ((t - 30.0) / 60.0)[:, None], 0)),
+    "force_drift": ("all drives", 0.3, lambda u, y, t: (u * ((t - 30.0) / 60.0)[:, None], 0)),
 }
 
 

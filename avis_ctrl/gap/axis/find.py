@@ -47,8 +47,8 @@ def find_axis_gap(kind: str, *, own: Sequence[Effect] = (), progress: Progress |
     Parameters
     ----------
     kind : "drive", "oscillator", "seismometer", or "levels" (a mode at several levels). data : arguments of
-    `mass.drive`, `mass.oscillator`, `seismometer.seismometer`, `levels.levels`. own : user-defined effects in addition
-    to the library.
+    `mass.drive`, `mass.oscillator`, `seismometer.seismometer`, `level_dependence.levels`. own : user-defined effects in
+    addition to the library.
 
     Raises
     ------

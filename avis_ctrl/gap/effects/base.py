@@ -203,14 +203,14 @@ class Effect(ABC):
 
     Attributes
     ----------
-    name : as in the contract. title : in words, for a sentence. looks_like : its signature in the responses.
+    name : as in docs/contracts/gap.md. title : in words, for a sentence. looks_like : its signature in the responses.
     at : where it can act, if its `places` do not depend on the table.
     nonlinear : depends on amplitude or time; acts through `volts`, `force` or `reading`.
     time_varying : a nonlinear effect that depends on time alone: at any level it is the same fraction of the response.
     strength : parameter to which `force` is proportional; empty if there is none.
     holds_states : has states of its own; their values at the ends of a record are estimated with its transient.
     resonant : adds resonances with many parameters, which a mode of any shape describes approximately.
-    outside : an effect of `effects.unnamed`, fitted in competition with the library and never named.
+    outside : an effect of `effects.outside_library`, fitted in competition with the library and never named.
     """
 
     name: str

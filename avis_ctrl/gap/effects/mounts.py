@@ -303,10 +303,10 @@ def median_rms(model: Table) -> float:
 
 @register
 class ContactFriction(Effect):
-    """Dahl friction at every motor, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
+    """Dahl friction at every drive, along its axis: f' = sigma v (1 - sign(v) f/F_c), F_c = sigma times the slip.
 
     P. R. Dahl, A solid friction model (1968): stiff and lossless for motion far below the slip, Coulomb friction far
-    above it. All contacts slip at the same displacement; the last fit distributes the stiffness among them.
+    above it. All contacts slip at the same displacement; their stiffnesses may differ from the mean.
     """
 
     name = "contact_friction"

@@ -56,7 +56,7 @@ class Late(UnnamedFault):
         return np.exp(-s * values["delay_s"]) / (1 + s * values["time_constant_s"])
 
     def seeds(self, score: Score, place: str) -> list[Seed]:
-        """Half of the total lateness each, because delay and lag are equal to first order. It cannot be negative."""
+        """Half of the total delay each, because delay and lag are equal to first order. It cannot be negative."""
         took = score.reduction(score.of_effect(active(self, score.model, place))[:1])
         half = float(took.coefficients[0]) / 2
         return [Seed((half, half), took.chi2, took.rank)] if half > 0 else []
@@ -196,7 +196,7 @@ class Gyroscope(UnnamedFault):
     """Moment h x w of a rotor with angular momentum h on the payload: s W on the rotations, W skew-symmetric."""
 
     name = "gyroscope"
-    words = "a rotor on the payload (moments at right angles to its tilting)"
+    words = "a rotor on the payload (gyroscopic moments)"
     at = ("payload",)
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
@@ -210,7 +210,7 @@ class Gyroscope(UnnamedFault):
         ops.extra = Z if ops.extra is None else ops.extra + Z
 
 
-ALL = "all motors"
+ALL = "all drives"
 
 
 @dataclass(frozen=True)
@@ -298,7 +298,7 @@ def _force_law(name: str, term: str, unit: str, power: int, law: Callable[[np.nd
 
 
 def _by_deflection(name: str, term: str, unit: str, power: int) -> AddedSignal:
-    """Force constants that depend on a power of the motors' deflection."""
+    """Force constants that depend on a power of the drives' deflection."""
 
     def where(model: Table) -> tuple[str, ...]:
         known = [one for one in model.motion.values() if len(one.driven_rows) == one.volts.shape[1]]
@@ -306,7 +306,7 @@ def _by_deflection(name: str, term: str, unit: str, power: int) -> AddedSignal:
 
     return AddedSignal(
         name,
-        f"a force constant of the motors that depends on {term}",
+        f"a force constant of the drives that depends on {term}",
         where,
         lambda model: _strength(unit, "of the force constant by deflection", 0.01 / largest_rms(model) ** power),
         lambda record: record.volts * record.deflection[:, record.driven_rows] ** power,
@@ -356,7 +356,7 @@ ADDED: dict[str, AddedSignal] = {
         ),
         AddedSignal(
             "clock_rate",
-            "outputs sampled by a clock of another rate than the inputs'",
+            "outputs sampled by a clock whose rate differs from that of the inputs",
             lambda model: ("loop",) if _read(model) else (),
             lambda model: EffectParameter(
                 "relative", "1", "rate of one clock over the other's, less one", 0.0, -0.01, 0.01, 1e-6

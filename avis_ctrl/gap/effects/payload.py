@@ -13,7 +13,7 @@ PRODUCTS = {"Jxy": "J12", "Jxz": "J13", "Jyz": "J23"}
 
 @register
 class ComOffset(Effect):
-    """Offset of the centre of mass from that of the rig file; parallel-axis terms included (equations.md)."""
+    """Offset of the centre of mass from that of the rig file; parallel-axis terms included (docs/theory/plant.md)."""
 
     name = "com_offset"
     title = "the centre of mass is not where the model has it"

@@ -48,7 +48,7 @@ class OfSensor(Effect):
 
 @register
 class GeophoneCorner(OfSensor):
-    """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter compensates a corner that does not exist.
+    """Output times (s^2 + 2 z0 w0 s + w0^2)/(s^2 + 2 z w s + w^2): the filter assumes another corner.
 
     Rademakers, section 2.1.1: the geophone is S s^2/(s^2 + 2 zn wn s + wn^2), the compensation has its zeros at wn, zn.
     """
@@ -121,7 +121,7 @@ class SensorMisalignment(OfSensor):
 
 @register
 class TiltCoupling(Effect):
-    """A horizontal inertial sensor reads a - g along its axis: a_x - g phi_y, a_y + g phi_x (equations.md, axes).
+    """A horizontal inertial sensor reads a - g along its axis: a_x - g phi_y, a_y + g phi_x.
 
     The magnitude of gravity is free: it must result as 9.8 m/s^2, with a sign given by the sensor's polarity.
     """

@@ -46,5 +46,5 @@ def _table(caption: str, some: list[Considered]) -> Table:
 
 def _none(found: GapFinding) -> str:
     if found.gap.verdict == "none":
-        return "No candidate was fitted: the score test was significant for no effect at any place."
+        return "No candidate raises the evidence enough to be accepted."
     return "No other candidate was fitted."

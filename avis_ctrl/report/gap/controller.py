@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 
 def controller(effect: DesignEffect) -> Section:
-    """The controller designed on the re-identified model, with both models, and the one designed on the updated "
-    "model."""
+    """The controller designed on the re-identified model, with both models; that designed on the updated model."""
     judged = listed(
         "An upper bound of mu below 1 guarantees the specified performance for every table of the design's "
         "uncertainty set. Decibels are those of the largest singular value from floor to payload. Worst cases are "

@@ -37,7 +37,7 @@ def _nowhere(gap: Gap) -> str:
             if gap.remaining
             else "No band of any channel exceeds the noise significantly."
         )
-    return "The places of the gap were not stated."
+    return "After re-identification, no band of any channel by itself exceeds the noise significantly."
 
 
 def heat_map(heat: HeatMap, named: bool) -> Figure:

@@ -67,9 +67,9 @@ def _left(gap: Gap) -> str:
         return "The residual was not computed."
     after = " with the named effects" if gap.effects else ""
     level = {
-        True: "It grows faster than the drives: its cause is not linear.",
-        False: "It does not grow faster than the drives.",
-        None: "It is too small, or the records are too few, to show whether it grows faster than the drives.",
+        True: "It grows faster than the drive level: its cause is not linear.",
+        False: "It does not grow faster than the drive level.",
+        None: "It is too small, or the records are too few, to show whether it grows faster than the drive level.",
     }[left.grows_with_level]
     places = (
         "The table below lists where it lies."
@@ -97,4 +97,4 @@ def next_step(found: GapFinding) -> str:
             "No further measurement is needed to name the missing effects. avis gap --design shows their influence "
             "on the controller; avis predict tests the updated model on another campaign."
         )
-    return "No further measurement is needed for this question."
+    return "No further measurement is suggested."

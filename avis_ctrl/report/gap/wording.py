@@ -18,8 +18,8 @@ from avis_ctrl.uncertain_value import with_prefix
 # What each verdict claims, and what it does not.
 CLAIMS = {
     "none": "Verdict: none. The parameters of the rig were re-identified, and the other values of the rig file were "
-    "fitted with their tolerances as standard deviations. The residual is noise, or less than 1 % of the "
-    "response. Apart from traces, no effect is named. An effect "
+    "fitted with their tolerances as standard deviations. The residual is noise, or exceeds it by less "
+    "than 1 % of the response. Apart from traces, no effect is named. An effect "
     "can still be present if it is too weak for this campaign, if these records do not excite it, or if "
     "the parameters of the rig can imitate it.",
     "explained": "Verdict: explained. Refitted values and the effects named above remove {removed} of the power that "
@@ -98,7 +98,7 @@ def probability(value: float) -> str:
     if not np.isfinite(value):
         return "not computed"
     if value >= GAP.most_sure:
-        return f"≥ {100 * GAP.most_sure:g} %"
+        return f"{100 * GAP.most_sure:g} %"
     return "< 0.1 %" if value < 0.001 else f"{words.number(100 * value)} %"
 
 
