@@ -25,10 +25,11 @@ from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
 from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile
-from avis_ctrl.identification.maximum_likelihood import Transient, whitened_real, whitener
+from avis_ctrl.identification.maximum_likelihood import whitened_real, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.response import N_Q
 from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.transients import Transients
 from avis_ctrl.identification.weights import with_distortion
 
 
@@ -95,18 +96,16 @@ def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
 
 
 class Part:
-    """One block at the model: its response, and the projection that removes its transient.
+    """One block at the model: its response with the initial values of its transient.
 
     body : (n, 12, 1) impulses and steps of the transient in the data; an effect changes the response to them, too.
     inner : (m,) initial internal states, for derivatives with respect to the model's own parameters.
     """
 
-    def __init__(self, model: TableModel, block: SpectralBlock):
-        self.model, self.block = model, block
+    def __init__(self, model: TableModel, block: SpectralBlock, body: np.ndarray | None, inner: np.ndarray | None):
+        self.model, self.block, self.body, self.inner = model, block, body, inner
         self.L = whitener(block)
         self.made = model.assembled(block.omega)
-        transient = Transient.of(model, block, self.L)
-        self.transient, self.body, self.inner = transient.Q, transient.body, transient.inner
         self.response = TableResponse(self.made, self._acting(model))
 
     def _acting(self, model: TableModel) -> Acting:
@@ -120,11 +119,8 @@ class Part:
         return self.response.s
 
     def real(self, dY: np.ndarray) -> np.ndarray:
-        """(k, n, n_y, m) of y to (k, N) real numbers, whitened, transient projected out."""
-        out = whitened_real(self.L, dY)
-        if self.transient.size:
-            out -= (self.transient @ (self.transient.T @ out.T)).T
-        return out
+        """(k, n, n_y, m) of y to (k, N) real numbers, whitened."""
+        return whitened_real(self.L, dY)
 
     def change(self, effect: ActiveEffect) -> np.ndarray:
         """(n, n_y, m) change of y by an effect, to first order."""
@@ -156,11 +152,12 @@ class Score:
     def __init__(self, model: TableModel, blocks: Sequence[SpectralBlock]):
         self.model = model
         self.kept: dict[Hashable, Any] = {}
-        self.parts = [Part(model, block) for block in blocks]
-        self.e = np.concatenate([part.real((part.block.Y - part.response.Y)[None])[0] for part in self.parts])
-        J = np.concatenate(
-            [part.real(model.answer(part.block, part.body, inner=part.inner).dY) for part in self.parts], axis=1
-        )
+        self.transients = Transients.of(model, blocks, [whitener(block) for block in blocks])
+        self.parts = [
+            Part(model, *one) for one in zip(blocks, *zip(*self.transients.initial, strict=True), strict=True)
+        ]
+        self.e = self._white([(part.block.Y - part.response.Y)[None] for part in self.parts])[0]
+        J = self._white([model.answer(part.block, part.body, inner=part.inner).dY for part in self.parts])
         J = J * model.scales()[:, None]
         size = np.linalg.norm(J, axis=1)
         _, s, Vt = np.linalg.svd(J / np.where(size > 0, size, 1.0)[:, None], full_matrices=False)
@@ -175,11 +172,17 @@ class Score:
     @cached_property
     def dof(self) -> int:
         """Degrees of freedom of the residual."""
-        return len(self.e) - len(self.basis) - sum(part.transient.shape[-1] for part in self.parts)
+        return len(self.e) - len(self.basis) - len(self.transients.covariance)
+
+    def _white(self, dY: Sequence[np.ndarray]) -> np.ndarray:
+        """(k, N) whitened rows of changes of y, one (k, n, n_y, m) per block, with the transients removed."""
+        rows = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        self.transients.remove_from(rows)
+        return rows
 
     def directions(self, dY: Sequence[np.ndarray]) -> np.ndarray:
         """(k, N) projected directions from changes of y, one (k, n, n_y, m) per block."""
-        A = np.concatenate([part.real(one) for part, one in zip(self.parts, dY, strict=True)], axis=1)
+        A = self._white(dY)
         rest = A - (A @ self.basis.T) @ self.basis
         rest[np.linalg.norm(rest, axis=1) < SETTINGS.least_left * np.linalg.norm(A, axis=1)] = 0
         return rest
@@ -232,7 +235,9 @@ class EvidenceScore(Score):
             with_distortion(block, level, fitted.variances, settings)
             for block, level in zip(data.blocks, data.levels, strict=True)
         ]
-        self.parts = [Part(self.model, block) for block in blocks]
+        self.transients = fitted.white.transients
+        initial = self.transients.initial
+        self.parts = [Part(self.model, block, *one) for block, one in zip(blocks, initial, strict=True)]
         self.profile = Profile(fitted, data, settings)
         self.basis, self.e = self.profile.basis, self.profile.e
 

@@ -13,8 +13,10 @@ contribution of the priors (R. M. Bell, D. F. McCaffrey, Survey Methodology 28 (
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from avis_ctrl.identification.variances import Group
 
@@ -38,12 +40,27 @@ def cluster_moves(
     return np.array(found)
 
 
-def covering(A: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """(k, k) covariance at least as large as A and B in every direction; A positive definite."""
-    L = np.linalg.cholesky(A)
-    ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
-    root = L @ (vectors * np.sqrt(np.maximum(ratio, 1.0)))
-    return np.asarray(root @ root.T)
+@dataclass(frozen=True, eq=False)
+class Robust:
+    """Covariance (n, n) of all parameters by the differences of clusters, and their number."""
+
+    covariance: np.ndarray
+    clusters: float
+
+    @property
+    def factor(self) -> float:
+        """Square of the 97.5 % quantile of Student's t over that of the normal distribution: a variance from a few
+        clusters is itself uncertain."""
+        return float(stats.t.ppf(0.975, max(self.clusters - 1, 1)) / stats.norm.ppf(0.975)) ** 2
+
+    def covering(self, A: np.ndarray, rows: Sequence[int]) -> np.ndarray:
+        """(k, k) covariance of some parameters, at least as large as A in every direction. Where it is larger by the
+        differences of clusters, the excess times `factor` is added. A : (k, k), positive definite."""
+        L = np.linalg.cholesky(A)
+        B = self.covariance[np.ix_(rows, rows)]
+        ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
+        root = L @ (vectors * np.sqrt(1 + self.factor * np.maximum(ratio - 1, 0.0)))
+        return np.asarray(root @ root.T)
 
 
 def clusterings(groups: Sequence[Group], bands_per_octave: int) -> tuple[list[list[list[Group]]], list[list[Group]]]:

@@ -2,7 +2,7 @@
 
     -2 log p(y, z) = |e(z)|^2 + log det C + |z|^2,    evidence = p(y, z) / sqrt(det(J J^T + I))
 
-z are standardised parameters; the transients of the records are projected out of the whitened residual e.
+z are standardised parameters; the transients of the records are removed from the whitened residual e (`transients`).
 """
 
 from __future__ import annotations
@@ -14,14 +14,23 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.special import log_ndtr
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
+from avis_ctrl.identification.clusters import Robust, cluster_moves, clusterings
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
-from avis_ctrl.identification.maximum_likelihood import Transient, block_residual, price_of_transient
+from avis_ctrl.identification.maximum_likelihood import (
+    as_complex,
+    as_real,
+    block_residual,
+    weight_cost,
+    whitened,
+    whitened_real,
+)
 from avis_ctrl.identification.priors import Priors, Tolerance
 from avis_ctrl.identification.spectra import thinned
 from avis_ctrl.identification.spectral_block import SpectralBlock
+from avis_ctrl.identification.transients import Transients
 from avis_ctrl.identification.variances import Group, Variances, bands, estimated, log_prior, mean_noise
 from avis_ctrl.identification.weights import Weights, path_contributions, weigh
 
@@ -46,12 +55,12 @@ class Data:
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) residual per block in the unit of
-    y. transients : of the blocks, to which e and J belong."""
+    y. transients : of the blocks, which were removed from e and J."""
 
     e: np.ndarray
     J: np.ndarray
     left: list[np.ndarray]
-    transients: Sequence[Transient] = ()
+    transients: Transients
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +68,10 @@ class Fitted:
     """The most probable parameters of a model.
 
     model : at the estimate. priors, z (n,), covariance (n, n) of z. variances : of path errors and distortion.
-    log_evidence : Laplace. log_likelihoods : by level and band; the remainder of the evidence comes from the priors.
-    iterations : Gauss-Newton steps. settings : of the fit. weights : of the data. white : residual and Jacobian,
-        whitened by noise and distortion; both empty once only the evidence is needed (`bare`).
+    log_evidence : Laplace. weight_cost : factor by which estimated noise weights increase the variances.
+    log_likelihoods : by level and band; the remainder of the evidence comes from the priors. iterations : Gauss-Newton
+    steps. settings : of the fit. weights : of the data. white : residual and Jacobian, whitened by noise and
+    distortion; both empty once only the evidence is needed (`bare`).
     """
 
     model: Any
@@ -70,6 +80,7 @@ class Fitted:
     covariance: np.ndarray
     variances: Variances
     log_evidence: float
+    weight_cost: float
     log_likelihoods: Mapping[Group, float]
     iterations: int
     settings: FitSettings
@@ -78,7 +89,9 @@ class Fitted:
 
     def bare(self) -> Fitted:
         """The fit without residual, Jacobian and weights, which take most of the memory."""
-        return replace(self, weights=Weights((), (), {}, {}), white=Evaluated(np.empty(0), np.empty((0, 0)), []))
+        return replace(
+            self, weights=Weights((), (), {}, {}), white=Evaluated(np.empty(0), np.empty((0, 0)), [], Transients.none())
+        )
 
     @cached_property
     def e(self) -> np.ndarray:
@@ -105,9 +118,8 @@ class Fitted:
         units = dict(zip(self.model.names, self.model.units, strict=True))
         at = [self.priors.names.index(name) for name in names]
         values, slopes = self.priors.values(self.z), self.priors.slopes(self.z)
-        std = np.sqrt(np.max([one.diagonal() for one in (self.covariance, *self._by_clusters)], axis=0))
         found = [
-            Tolerance(name, float(values[k]), float(std[k] * slopes[k]), float(self.z[k]), units[name])
+            Tolerance(name, float(values[k]), float(self._std[k] * slopes[k]), float(self.z[k]), units[name])
             for name, k in zip(names, at, strict=True)
         ]
         return tuple(sorted(found, key=lambda one: -abs(one.moved)))
@@ -120,39 +132,46 @@ class Fitted:
         """
         free = [k for k, name in enumerate(names) if name in self.priors.names]
         rows = [self.priors.names.index(names[k]) for k in free]
-        own = self.covariance[np.ix_(rows, rows)]
+        own = self.weight_cost * self.covariance[np.ix_(rows, rows)]
         for robust in self._by_clusters if rows else ():
-            own = covering(own, robust[np.ix_(rows, rows)])
+            own = robust.covering(own, rows)
         found, slopes = np.zeros((len(names), len(names))), self.priors.slopes(self.z)[rows]
         found[np.ix_(free, free)] = own * slopes * slopes[:, None]
         return found
 
     def whole_covariance(self) -> np.ndarray:
-        """(n, n) of all parameters in their units: that of the model times one factor, by which octaves or levels
-        differ more than it predicts. The factor is a mean over all directions, because there are more directions than
-        octaves."""
-        ratios = [float(np.mean(np.diag(np.linalg.solve(self.covariance, one)))) for one in self._by_clusters]
-        slopes = self.priors.slopes(self.z)
-        return np.asarray(max(1.0, *ratios) * self.covariance * slopes * slopes[:, None])
+        """(n, n) of all parameters in their units: the standard deviations are those of `covariance_of`, the
+        correlations those of the model, because there are more directions than octaves."""
+        wider = self._std / np.sqrt(np.diag(self.covariance)) * self.priors.slopes(self.z)
+        return np.asarray(self.covariance * wider * wider[:, None])
 
     @cached_property
-    def _by_clusters(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, n) covariances of z from the differences of octaves and of levels; the model's own for a fit without its
-        residual, or with one cluster."""
-        if not len(self.white.e):
-            return self.covariance, self.covariance
+    def _std(self) -> np.ndarray:
+        """(n,) standard deviations of z, as those of `covariance_of`."""
+        variance = self.weight_cost * np.diag(self.covariance)
+        for robust in self._by_clusters:
+            variance = variance + robust.factor * np.maximum(np.diag(robust.covariance) - variance, 0.0)
+        return np.sqrt(variance)
 
+    @cached_property
+    def _by_clusters(self) -> list[Robust]:
+        """Covariances of z from the differences of octaves and of levels; none for a fit without its residual, or with
+        one cluster."""
+        if not len(self.white.e):
+            return []
         J = self.J
 
-        def robust(parts: Sequence[Sequence[Group]]) -> np.ndarray:
-            rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
-            if len(rows) == 1:
-                return self.covariance
-            moves = cluster_moves(self.covariance, J, self.e, rows, self.settings.least_elsewhere)
-            return np.asarray(self.covariance @ self.covariance + moves.T @ moves)
+        def robust(clusterings: Sequence[Sequence[Sequence[Group]]]) -> Robust:
+            found = []
+            for parts in clusterings:
+                rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
+                moves = cluster_moves(self.covariance, J, self.e, rows, self.settings.least_elsewhere)
+                found.append(self.covariance @ self.covariance + moves.T @ moves)
+            return Robust(np.mean(found, axis=0), float(np.mean([len(parts) for parts in clusterings])))
 
         by_octave, by_level = clusterings(list(self.weights.rows), self.settings.bands_per_octave)
-        return np.mean([robust(parts) for parts in by_octave], axis=0), robust(by_level)
+        several = [[parts for parts in one if len(parts) > 1] for one in (by_octave, [by_level])]
+        return [robust(one) for one in several if one]
 
 
 def first_variances(data: Data, settings: FitSettings) -> Variances:
@@ -232,6 +251,24 @@ def descent(
     return at, iterations
 
 
+def _log_volume(at: _Expansion, priors: Priors) -> float:
+    """log of the posterior's volume over that of the prior, by Laplace's approximation within the bounds.
+
+    A normal distribution with the curvature of the expansion, at a bound also with its gradient, is integrated between
+    the bounds of each parameter; the others follow to first order, and different parameters are taken as independent.
+    """
+    H, (low, high) = at.H + np.eye(len(at.z)), priors.bounds
+    bounded = np.isfinite(low) | np.isfinite(high)
+    std = np.sqrt(np.diag(np.linalg.inv(H))[bounded])
+    outward = (at.z - at.g)[bounded] * std  # gradient of half the sum of squares, zero within the bounds
+    outward = np.where((at.z <= low)[bounded] | (at.z >= high)[bounded], outward, 0.0)
+    below, above = ((end - at.z)[bounded] / std + outward for end in (low, high))
+    # log(Phi(above) - Phi(below)) on the side where both are small.
+    below, above = np.where(below > 0, -above, below), np.where(below > 0, -below, above)
+    inside = log_ndtr(above) + np.log1p(-np.exp(log_ndtr(below) - log_ndtr(above))) + outward**2 / 2
+    return float(-0.5 * np.linalg.slogdet(H)[1] - priors.log_inside + np.sum(inside))
+
+
 def _bounded_step(at: _Expansion, damping: float, bounds: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """z (n,) after a damped Gauss-Newton step within bounds.
 
@@ -298,11 +335,10 @@ def fit(
         variances = estimated(at.now.left, data.blocks, data.levels, paths, variances, settings, hold_path=not released)
     assert best is not None
     reached, at, weights, variances = best
-    H = at.H + np.eye(len(at.z))
-    log_evidence = reached - _price_of_ends(at.model, data, weights) - 0.5 * np.linalg.slogdet(H)[1] - priors.log_inside
+    log_evidence = reached - at.now.transients.price + _log_volume(at, priors)
     by_group = _by_group(weights, weights.flatten(at.now.e[None])[0])
     # By eigenvalues: with poorly determined directions, round-off makes `inv` neither symmetric nor positive definite.
-    size, vectors = np.linalg.eigh(H)
+    size, vectors = np.linalg.eigh(at.H + np.eye(len(at.z)))
     root = vectors / np.sqrt(np.maximum(size, 1.0))  # the priors contribute at least 1
     return Fitted(
         at.model,
@@ -311,6 +347,7 @@ def fit(
         root @ root.T,
         variances,
         float(log_evidence),
+        float(np.average([weight_cost(one) for one in data.blocks], weights=[one.numbers for one in data.blocks])),
         by_group,
         steps,
         settings,
@@ -338,11 +375,6 @@ def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETT
     return fit(fitted.model, fitted.priors, fitted.z, data, variances, replace(settings, rounds=0))
 
 
-def _price_of_ends(model: Any, data: Data, weights: Weights) -> float:
-    """`price_of_transient` of all blocks."""
-    return sum(price_of_transient(model, block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True))
-
-
 class Profile:
     """A fit to which a few parameters are added; those of the fit follow to first order (profile likelihood).
 
@@ -356,15 +388,13 @@ class Profile:
         self.e = self.free(fitted.white.e[None], -fitted.z)[0]
 
     def free(self, white: np.ndarray, prior: np.ndarray | float = 0.0) -> np.ndarray:
-        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), after projecting out the fit's
-        parameters."""
-        rows = self.fitted.weights.flatten(white)
+        """(k, N + n) of whitened rows (k, N), with those of the priors (n,), after projecting out the transients and
+        the fit's parameters."""
+        rows = white.copy()
+        self.fitted.white.transients.remove_from(rows)
+        rows = self.fitted.weights.flatten(rows)
         rows = np.concatenate([rows, np.broadcast_to(prior, (len(rows), len(self.fitted.z)))], axis=1)
         return rows - (rows @ self.basis.T) @ self.basis
-
-    @cached_property
-    def _price_of_ends(self) -> float:
-        return _price_of_ends(self.fitted.model, self.data, self.fitted.weights)
 
     @cached_property
     def _white_basis(self) -> np.ndarray:
@@ -394,24 +424,27 @@ class Profile:
 
         end, _ = descent(expand, z, priors, iterations, self.settings)
         fall = float(self.e @ self.e) - end.whole
-        gain = 0.5 * (fall - np.linalg.slogdet(end.H + np.eye(len(z)))[1])
-        gain += self._price_of_ends - _price_of_ends(end.model, self.data, weights) - priors.log_inside
+        gain = 0.5 * fall + _log_volume(end, priors) + self.fitted.white.transients.price - end.now.transients.price
         return end.z, gain, fall
 
 
 def log_likelihood(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> float:
     """Log-likelihood of records that were not fitted, with the fitted parameters and variances. The states at the
     records' ends are integrated out."""
-    weights, flat = unseen(fitted, data, settings)
-    return sum(_by_group(weights, flat).values()) - _price_of_ends(fitted.model, data, weights)
+    weights, own = _unseen(fitted, data, settings)
+    return sum(_by_group(weights, weights.flatten(own.e[None])[0]).values()) - own.transients.price
 
 
 def unseen(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> tuple[Weights, np.ndarray]:
     """Weights and (N,) residual of records that were not fitted, as `Fitted.weights` and `Fitted.e`."""
+    weights, own = _unseen(fitted, data, settings)
+    return weights, weights.flatten(own.e[None])[0]
+
+
+def _unseen(fitted: Fitted, data: Data, settings: FitSettings) -> tuple[Weights, Evaluated]:
     paths = [path_contributions(fitted.model, block) for block in data.blocks]
     weights = weigh(data.blocks, data.levels, paths, fitted.variances, settings)
-    own = _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
-    return weights, weights.flatten(own.e[None])[0]
+    return weights, _evaluate(fitted.model, fitted.priors, fitted.z, data, weights, derivative=False)
 
 
 def _by_group(weights: Weights, flat: np.ndarray) -> dict[Group, float]:
@@ -431,16 +464,17 @@ def _evaluate(
     near: Evaluated | None = None,
 ) -> Evaluated:
     """near : whose transients are kept."""
-    blocks = [(block, L[:, None]) for block, L in zip(data.blocks, weights.L, strict=True)]
-    transients = near.transients if near else [Transient.of(model, *one) for one in blocks]
-    parts = [
-        transient.residual(model, *one, derivative=derivative)
-        for transient, one in zip(transients, blocks, strict=True)
-    ]
-    e = np.concatenate([one[0] for one in parts])
-    J = np.empty((len(z) if derivative else 0, len(e)))
-    start, slopes = 0, priors.slopes(z)[:, None]
-    for own, rows, _ in parts if derivative else ():
-        np.multiply(rows, slopes, out=J[:, start : start + len(own)])
-        start += len(own)
-    return Evaluated(e, J, [left for _, _, left in parts], transients)
+    whiteners = [L[:, None] for L in weights.L]
+    transients = near.transients if near else Transients.of(model, data.blocks, whiteners, weights.paths)
+    e = np.empty(transients.rows[-1].stop)
+    J, slopes = np.empty((len(z) if derivative else 0, len(e))), priors.slopes(z)[:, None]
+    parts = list(zip(data.blocks, whiteners, transients.rows, transients.initial, strict=True))
+    for block, L, rows, (body, inner) in parts:
+        found = model.answer(block, body, derivative, inner)
+        e[rows] = as_real(whitened(L, block.Y - found.Y)[None])[0]
+        if derivative:
+            np.multiply(whitened_real(L, found.dY), slopes, out=J[:, rows])
+    transients.remove_from(e[None])
+    transients.remove_from(J)
+    left = [np.linalg.solve(L[:, 0], as_complex(e[rows], block.Y.shape))[:, :, 0] for block, L, rows, _ in parts]
+    return Evaluated(e, J, left, transients)

@@ -377,72 +377,17 @@ def block_residual(
     return e, J, Residual(block, plain, error, white / np.sqrt(2))
 
 
-@dataclass(frozen=True, eq=False)
-class Transient:
-    """Transient of a block during a step of a fit: the response to fixed initial values is part of the model; all other
-    transients are projected out.
-
-    Q : (N, r) orthonormal basis of the whitened transients at the start of the step. body, inner : the initial values,
-        as in `transient_parts`; None for a block without a transient.
-
-    With a fixed basis the gradient is exact for any weights of the residuals. `block_residual` leaves out that its
-    basis depends on the parameters (L. Kaufman, BIT 15 (1975) 49-57); its gradient is exact with its own weights only.
-    """
-
-    Q: np.ndarray
-    body: np.ndarray | None
-    inner: np.ndarray | None
-
-    @staticmethod
-    def of(model: FrequencyModel, block: SpectralBlock, L: np.ndarray) -> Transient:
-        """The transient at a model: its most likely initial values."""
-        if not block.transient:
-            return Transient(np.zeros((0, 0)), None, None)
-        _, norms, Q, X = whitened_transient(model, block, L)
-        e = as_real(whitened(L, block.Y - model.answer(block, None, False).Y)[None])[0]
-        return Transient(Q, *transient_parts(X @ (Q.T @ e), norms, block, model))
-
-    def residual(
-        self, model: FrequencyModel, block: SpectralBlock, L: np.ndarray, *, derivative: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """e (N,) and J (n_p, N) as `block_residual`, and the residual (n, n_y) in the unit of y."""
-        found = model.answer(block, self.body, derivative, self.inner)
-        white = whitened(L, block.Y - found.Y)
-        e = as_real(white[None])[0]
-        J = whitened_real(L, found.dY) if derivative else np.empty(0)
-        if self.Q.size:
-            e -= self.Q @ (self.Q.T @ e)
-            if derivative:
-                J -= (self.Q @ (self.Q.T @ J.T)).T  # parameters come last in memory
-            white = (e[: len(e) // 2] + 1j * e[len(e) // 2 :]).reshape(white.shape)
-        return e, J, np.linalg.solve(L[:, 0], white)[:, :, 0]
-
-
 def whitened_transient(
     model: FrequencyModel, block: SpectralBlock, L: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """`transient_columns` of a block with their norms, and `span` Q (N, r), X (n_t, r) of the whitened columns."""
     columns, norms = transient_columns(model, block.omega)
-    return columns, norms, *span(_white_columns(columns, L).T)
+    return columns, norms, *span(white_columns(columns, L).T)
 
 
-def _white_columns(columns: np.ndarray, L: np.ndarray) -> np.ndarray:
+def white_columns(columns: np.ndarray, L: np.ndarray) -> np.ndarray:
     """(n_t, N) whitened real columns from (n, n_y, n_t)."""
     return as_real(np.moveaxis(whitened(L, columns), -1, 0))
-
-
-def price_of_transient(model: FrequencyModel, block: SpectralBlock, L: np.ndarray) -> float:
-    """Decrease of a block's log-likelihood if the unknowns of its transient are integrated out: log det(I + N C)/2,
-    with C the Gram matrix of their whitened columns of unit norm, and N real data.
-
-    Each independent column costs log(N)/2 (unit-information prior, Schwarz 1978), a nearly dependent one less.
-    """
-    if not block.transient:
-        return 0.0
-    columns = _white_columns(transient_columns(model, block.omega)[0], L)
-    gram = columns @ columns.T
-    norms = np.sqrt(np.maximum(np.diag(gram), np.finfo(float).tiny))
-    return 0.5 * float(np.linalg.slogdet(np.eye(len(gram)) + block.numbers * gram / (norms * norms[:, None]))[1])
 
 
 def added_terms(
@@ -523,6 +468,11 @@ def as_real(white: np.ndarray) -> np.ndarray:
     """(p, ...) complex to (p, N) real."""
     flat = white.reshape(len(white), -1)
     return np.concatenate([flat.real, flat.imag], axis=1)
+
+
+def as_complex(real: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """(N,) of `as_real` back to a complex array of this shape."""
+    return np.asarray(real[: len(real) // 2] + 1j * real[len(real) // 2 :]).reshape(shape)
 
 
 def transient_unknowns(block: SpectralBlock, model: FrequencyModel) -> int:

@@ -82,7 +82,11 @@ def as_likelihood_fit(
     known = np.where(found.flat, 0.0, 1.0)
     slopes = one.priors.slopes(one.z)
     information = Information(
-        model.names, model.values, model.units, (H + np.diag(known)) / np.outer(slopes, slopes), model.scales()
+        model.names,
+        model.values,
+        model.units,
+        (H / one.weight_cost + np.diag(known)) / np.outer(slopes, slopes),
+        model.scales(),
     )
     step = np.linalg.solve(H + np.eye(len(g)), g - one.z)
     less = int(known.sum()) - sum(transient_unknowns(block, model) for block in blocks) - information.rank

@@ -33,6 +33,11 @@ class PathError:
     Q: np.ndarray
     size: np.ndarray
 
+    @property
+    def share(self) -> np.ndarray:
+        """(r,) fraction of the power along Q that the inverse covariance leaves out."""
+        return self.size / (1 + self.size)
+
 
 @dataclass(frozen=True, eq=False)
 class Weights:
@@ -66,10 +71,9 @@ class Weights:
         H, g, cost = J @ J.T, J @ e, float(e @ e)
         for one in self.paths:
             along, of = J[:, one.rows] @ one.Q, one.Q.T @ e[one.rows]
-            less = one.size / (1 + one.size)
-            H -= (along * less) @ along.T
-            g -= along @ (less * of)
-            cost -= float(less @ of**2)
+            H -= (along * one.share) @ along.T
+            g -= along @ (one.share * of)
+            cost -= float(one.share @ of**2)
         return H, g, cost
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scipy import stats
+from scipy import integrate, stats
 from scipy.optimize import lsq_linear, minimize
 
 from avis_ctrl.gap.effects.library import library
@@ -21,22 +21,24 @@ from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import by_information, change_from, halves
-from avis_ctrl.identification.clusters import cluster_moves, clusterings, covering
+from avis_ctrl.identification.clusters import Robust, cluster_moves, clusterings
 from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
 from avis_ctrl.identification.maximum_likelihood import (
-    Transient,
+    as_real,
     block_residual,
-    price_of_transient,
     transient_unknowns,
+    white_columns,
     whitened,
+    whitened_real,
 )
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import Priors, beside, identified, re_identified, with_tolerances
-from avis_ctrl.identification.response import ResponseModel
+from avis_ctrl.identification.response import Driven, ResponseModel
 from avis_ctrl.identification.spectra import transient_columns
 from avis_ctrl.identification.spectral_block import SpectralBlock
-from avis_ctrl.identification.variances import Variances, estimated
+from avis_ctrl.identification.transients import Transients
+from avis_ctrl.identification.variances import Variances, bands, estimated
 from avis_ctrl.identification.weights import path_contributions, weigh
 from avis_ctrl.rigs import load_rig
 from avis_ctrl.rigs.instruments import Tolerances
@@ -124,33 +126,112 @@ def test_a_step_to_a_bound_ends_there():
     assert priors.values(priors.stepped(np.zeros(1), priors.bounds[1])) == 44.0
 
 
+def with_path_errors(blocks, model, error):
+    """Weights of blocks with relative path errors of this size, and the whitening matrices."""
+    data, settings = Data(tuple(blocks), tuple(0.2 + 0.2 * k for k in range(len(blocks)))), GapSettings()
+    first = first_variances(data, settings)
+    variances = Variances(
+        {band: np.full_like(v, error**2) for band, v in first.path.items()},
+        {group: np.full_like(s, 1e-9) for group, s in first.distortion.items()},
+    )
+    weights = weigh(data.blocks, data.levels, [path_contributions(model, one) for one in blocks], variances, settings)
+    return weights, [L[:, None] for L in weights.L]
+
+
+def white_rows(model, blocks, whiteners, transients, derivative=True):
+    """Whitened residual and Jacobian, with the transients removed."""
+    found = [
+        model.answer(one, body, derivative, inner)
+        for one, (body, inner) in zip(blocks, transients.initial, strict=True)
+    ]
+    rows = zip(blocks, whiteners, found, strict=True)
+    e = np.concatenate([as_real(whitened(L, one.Y - each.Y)[None])[0] for one, L, each in rows])
+    transients.remove_from(e[None])
+    if not derivative:
+        return e, None
+    J = np.concatenate([whitened_real(L, each.dY) for L, each in zip(whiteners, found, strict=True)], axis=1)
+    transients.remove_from(J)
+    return e, J
+
+
 def test_the_gradient_is_exact_with_path_errors():
-    """Of the penalised sum of squares with a fixed basis of the transient, by parameters far from their optimum;
-    against differences."""
-    settings = GapSettings()
+    """Of the penalised sum of squares by parameters far from their optimum, against differences: with the transients
+    of the model, and with those that follow the parameters."""
     names = ("isolator1.c_z", "isolator2.p_x", "sensor.Sz1", "mass", "J13")
     model = bare(names)
-    one = replace(block(bare(), 3, 40, 1e-5), Y=block(bare(), 3, 40, 1e-5).Y * 1.01)
-    data = Data((one,), (0.2,))
-    paths = [path_contributions(model, one)]
-    weights = weigh(data.blocks, data.levels, paths, first_variances(data, settings), settings)
-    L = weights.L[0][:, None]
-    transient, scale = Transient.of(model, one, L), 1e-3 * np.abs(model.scales())
+    blocks = [replace(one, Y=one.Y * 1.01) for one in (block(bare(), seed, 40, 1e-5) for seed in (3, 4))]
+    weights, whiteners = with_path_errors(blocks, model, 0.01)
+    transients, scale = Transients.of(model, blocks, whiteners, weights.paths), 1e-3 * np.abs(model.scales())
 
-    def cost(theta):
-        e = transient.residual(model.at(theta), one, L, derivative=False)[0]
+    def cost(theta, following):
+        moved = model.at(theta)
+        own = Transients.of(moved, blocks, whiteners, weights.paths) if following else transients
+        e, _ = white_rows(moved, blocks, whiteners, own, derivative=False)
         return weights.normal_equations(np.empty((0, len(e))), e)[2]
 
-    e, J, left = transient.residual(model, one, L, derivative=True)
+    e, J = white_rows(model, blocks, whiteners, transients)
     _, g, _ = weights.normal_equations(J, e)
-    for k, h in enumerate(np.diag(scale)):
-        slope = (cost(model.values + h) - cost(model.values - h)) / (2 * scale[k])
-        assert -2 * g[k] == pytest.approx(slope, rel=1e-3, abs=1e-5 * np.linalg.norm(J[k]) * np.linalg.norm(e))
-    # At the model itself, residual and Jacobian are those of the projection that follows the parameters.
-    e_following, J_following, found = block_residual(model, one, L, derivative=True)
-    assert_allclose(e, e_following, atol=1e-9 * np.linalg.norm(e))
-    assert_allclose(J, J_following, atol=1e-9 * np.linalg.norm(J))
-    assert_allclose(left, found.error[:, :, 0], atol=1e-9 * np.linalg.norm(left))
+    for following in (False, True):
+        for k, h in enumerate(np.diag(scale)):
+            slope = (cost(model.values + h, following) - cost(model.values - h, following)) / (2 * scale[k])
+            assert -2 * g[k] == pytest.approx(slope, rel=1e-3, abs=1e-5 * np.linalg.norm(J[k]) * np.linalg.norm(e))
+    # Without path errors, residual and Jacobian are those of a fit by noise alone.
+    plain = Transients.of(model, blocks[:1], whiteners[:1])
+    e, J = white_rows(model, blocks[:1], whiteners[:1], plain)
+    e_known, J_known, _ = block_residual(model, blocks[0], whiteners[0], derivative=True)
+    assert_allclose(e, e_known, atol=1e-9 * np.linalg.norm(e))
+    assert_allclose(J, J_known, atol=1e-9 * np.linalg.norm(J))
+
+
+def test_transients_are_removed_by_generalised_least_squares():
+    """Normal equations and determinant against dense matrices; two records, whose path errors are the same."""
+    model = bare(("isolator1.k_z", "mass", "sensor.Sz1"))
+    blocks = [replace(one, Y=one.Y * 1.02) for one in (block(bare(), seed, 30, 1e-5) for seed in (3, 4))]
+    weights, whiteners = with_path_errors(blocks, model, 0.02)
+    transients = Transients.of(model, blocks, whiteners, weights.paths)
+    H, g, cost = weights.normal_equations(*reversed(white_rows(model, blocks, whiteners, transients)))
+    free = replace(
+        transients, bases=tuple(Q[:, :0] for Q in transients.bases), along=(), paths=(), covariance=np.eye(0)
+    )
+    e, J = white_rows(model, blocks, whiteners, free)
+    T = [white_columns(transient_columns(model, one.omega)[0], L) for one, L in zip(blocks, whiteners, strict=True)]
+    T = np.block([[T[0], np.zeros_like(T[1])], [np.zeros_like(T[0]), T[1]]])
+    W = weights.flatten(weights.flatten(np.eye(len(e))))
+    assert_allclose(W, W.T, atol=1e-10)
+    left = W - W @ T.T @ np.linalg.solve(T @ W @ T.T, T @ W)
+    assert_allclose(H, J @ left @ J.T, rtol=1e-6)
+    assert_allclose(g, J @ left @ e, rtol=1e-6, atol=1e-6 * np.linalg.norm(J, axis=1).max())
+    assert cost == pytest.approx(e @ left @ e, rel=1e-6)
+    A = weights.flatten(T)
+    A *= np.sqrt(len(e) / 2) / np.linalg.norm(A, axis=1)[:, None]
+    assert transients.price == pytest.approx(0.5 * np.linalg.slogdet(np.eye(len(e)) + A.T @ A)[1], rel=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "error"), [(1e-5, 0.01), (1e-5, 0.05), (1e-3, 0.05)])
+def test_standard_deviations_hold_with_path_errors_and_transients(noise, error):
+    """Sum of squares, and error over standard deviation, in 100 draws of path errors and noise of one record. (If the
+    transients were estimated with the weights of the noise alone, the errors were up to nine standard deviations.)"""
+    model, rng = bare(("isolator1.k_z", "isolator2.k_x", "mass")), np.random.default_rng(5)
+    exact = replace(
+        block(bare(), 3, 150, noise), Y=model.driven(block(bare(), 3, 150).omega, block(bare(), 3, 150).U).Y
+    )
+    paths = path_contributions(model, exact)
+    weights, whiteners = with_path_errors([exact], model, error)
+    own, errors, squares = bands(exact.omega, GapSettings().bands_per_octave), [], []
+    for _ in range(100):
+        of_band = {band: rng.standard_normal((2, *paths.shape[1:])) for band in np.unique(own)}
+        eps = np.array([error * (of_band[band][0] + 1j * of_band[band][1]) / np.sqrt(2) for band in own])
+        white = rng.standard_normal((2, 150, 6))
+        Y = exact.Y[:, :, 0] + np.sum(paths * eps, axis=2) + np.sqrt(noise / 2) * (white[0] + 1j * white[1])
+        drawn = replace(exact, Y=Y[:, :, None])
+        transients = Transients.of(model, [drawn], whiteners, weights.paths)
+        H, g, cost = weights.normal_equations(*reversed(white_rows(model, [drawn], whiteners, transients)))
+        errors.append(np.linalg.solve(H, g) / np.sqrt(np.diag(np.linalg.inv(H))))
+        squares.append(cost)
+    expected = 2 * 150 * 6 - transient_unknowns(exact, model)
+    assert np.mean(squares) == pytest.approx(expected, rel=0.02)
+    assert_allclose(np.sqrt(np.mean(np.square(errors), axis=0)), 1, atol=0.25)
+    assert 0.9 < np.mean(np.abs(errors) < 1.96) < 0.99
 
 
 def test_path_errors_are_integrated_out_as_a_dense_covariance_would_do():
@@ -504,11 +585,30 @@ def test_a_covering_covariance_is_no_smaller_in_any_direction():
     for k in (1, 3, 5):
         X, few = rng.standard_normal((k, k + 2)), rng.standard_normal((k, 2))
         A, B = X @ X.T, few @ few.T
-        C = covering(A, B)
+        C = Robust(B, 3).covering(A, range(k))
         for one in (A, B):
             assert np.min(np.linalg.eigvalsh(C - one)) > -1e-9 * np.max(C)
-        assert_allclose(covering(A, 0.5 * A), A, rtol=1e-9)
-        assert_allclose(covering(A, 3 * A), 3 * A, rtol=1e-9)
+        assert_allclose(Robust(0.5 * A, 3).covering(A, range(k)), A, rtol=1e-9)
+        # Student's t with two degrees of freedom: 4.303 instead of 1.960.
+        assert_allclose(Robust(3 * A, 3).covering(A, range(k)), (1 + 2 * (4.303 / 1.960) ** 2) * A, rtol=1e-3)
+
+
+@pytest.mark.parametrize("clusters", [2, 3, 6])
+@pytest.mark.parametrize("scatter", [0.0, 1.0, 3.0, 10.0])
+def test_intervals_from_a_few_clusters_contain_the_truth(clusters, scatter):
+    """One parameter that differs between levels, by this multiple of the model's standard deviation (mean of all)."""
+    rng, draws, n = np.random.default_rng(7), 600, 20
+    J = np.full((1, clusters * n), 30 / np.sqrt(clusters * n))
+    P = np.linalg.inv(J @ J.T + np.eye(1))
+    rows, inside = np.split(np.arange(clusters * n), clusters), 0
+    for _ in range(draws):
+        own = scatter * np.sqrt(P[0, 0] * clusters) * rng.standard_normal(clusters)
+        y = np.repeat(own, n) * J[0] + rng.standard_normal(clusters * n)
+        z = P @ (J @ y)
+        moves = cluster_moves(P, J, y - z @ J, rows)
+        variance = Robust(P @ P + moves.T @ moves, clusters).covering(P, [0])[0, 0]
+        inside += abs(z[0]) < 1.96 * np.sqrt(variance)
+    assert 0.83 < inside / draws < 0.99
 
 
 def test_clusters_are_octaves_of_bands_and_levels():
@@ -537,9 +637,70 @@ def test_a_state_at_the_ends_costs_what_it_adds(name, place, cost):
         A = np.concatenate([columns.real, columns.imag])
         A = A / np.linalg.norm(A, axis=0)
         whole = 0.5 * np.linalg.slogdet(np.eye(len(A)) + len(A) * A @ A.T)[1]
-        prices.append(price_of_transient(model, record, L))
+        prices.append(Transients.of(model, [record], [L]).price)
         assert prices[-1] == pytest.approx(whole, rel=1e-6)
     assert cost[0] < prices[1] - prices[0] < cost[1]
+
+
+@dataclass(frozen=True, eq=False)
+class OneParameter:
+    """y = a x on each line."""
+
+    x: np.ndarray
+    values: np.ndarray
+    names: tuple[str, ...] = ("a",)
+    units: tuple[str, ...] = ("1",)
+    labels: tuple[str, ...] = ()
+
+    def at(self, values):
+        return replace(self, values=np.asarray(values, float))
+
+    def answer(self, block, body=None, derivative=True, inner=None):
+        return Driven((self.x * self.values[0])[:, None, None], self.x[None, :, None, None])
+
+    def contributions(self, block):
+        return np.zeros((len(block.omega), 1, 1), complex)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "low", "high"),
+    [
+        (5.0, -np.inf, np.inf),
+        (5.0, 0.0, np.inf),
+        (0.5, 0.0, np.inf),
+        (0.0, 0.0, np.inf),
+        (-3.0, 0.0, np.inf),
+        (8.0, 0.0, 5.0),
+        (2.0, 0.0, 3.0),
+        (-0.2, -0.5, 0.3),
+    ],
+)
+def test_evidence_within_bounds(estimate, low, high):
+    """Of one linear parameter with a standard deviation of 1 and a prior of 10, against quadrature."""
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal(40) + 1j * rng.standard_normal(40)
+    x /= np.sqrt(2) * np.linalg.norm(x)
+    omega = 2 * np.pi * np.geomspace(1, 50, 40)
+    empty = SpectralBlock("a", omega, np.zeros((40, 0, 1)), estimate * x[:, None, None])
+    one = empty.with_noise(np.ones((40, 1, 1), complex))
+    data, settings = Data((one,), (1.0,)), replace(SETTINGS, rounds=0, converged=1e-12)
+    first = first_variances(data, settings)
+    none = Variances(
+        {band: np.full_like(v, 1e-12) for band, v in first.path.items()},
+        {group: np.full_like(s, 1e-12) for group, s in first.distortion.items()},
+    )
+
+    def evidence(size, low, high):
+        priors = Priors(("a",), np.zeros(1), np.array([size]), np.zeros(1, bool), np.array([low]), np.array([high]))
+        return fit(OneParameter(x, np.zeros(1)), priors, np.zeros(1), data, none, settings).log_evidence
+
+    def density(a):
+        return np.exp(a * estimate - a * a / 2) * stats.norm.pdf(a / 10) / 10
+
+    volume = stats.norm.cdf(high / 10) - stats.norm.cdf(low / 10)
+    ends = max(low, -60), min(high, 60)
+    exact = np.log(integrate.quad(density, *ends, points=[np.clip(estimate, *ends)], limit=400)[0] / volume)
+    assert evidence(10.0, low, high) - evidence(1e-9, -np.inf, np.inf) == pytest.approx(exact, abs=1e-3)
 
 
 def test_priors_are_normalised_inside_their_bounds():
