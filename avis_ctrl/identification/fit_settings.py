@@ -31,8 +31,8 @@ class FitSettings:
         flank of a mode changes by a factor of two.
     least_error : relative error that cannot be excluded for any path [1], the scale of its prior: cables, threads and
         glue change a response by 0.1 % from day to day.
-    error_weight : degrees of freedom of the priors of the variances; two, the minimum for a finite mean of the
-        precision.
+    error_weight : degrees of freedom of the priors of the variances: two, as if two squares of their scale had been
+        observed.
     first_error : relative error of the paths in the first fit [1], before any residual is known.
     variance_steps : maximum number of scoring steps from each start of an estimate of the variances; on average,
         six suffice.

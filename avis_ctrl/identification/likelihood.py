@@ -55,12 +55,13 @@ class Data:
 @dataclass(frozen=True, eq=False)
 class Evaluated:
     """e (N,) whitened residual, J (n, N) its negative derivative by z, left (n, n_y) residual per block in the unit of
-    y. transients : of the blocks, which were removed from e and J."""
+    y. transients : of the blocks, which were removed from e and J. along : `Weights.along` of (J, e)."""
 
     e: np.ndarray
     J: np.ndarray
     left: list[np.ndarray]
     transients: Transients
+    along: Sequence[np.ndarray] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +322,7 @@ def fit(
         def expand(z: np.ndarray, derivative: bool, near: Evaluated | None, weights: Weights = weights) -> _Expansion:
             moved = begun.at(priors.values(z))
             now = _evaluate(moved, priors, z, data, weights, derivative, near)
-            return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e))
+            return _Expansion(moved, z, now, *weights.normal_equations(now.J, now.e, now.along))
 
         at, more = descent(expand, z, priors, settings.iterations, settings)
         model, z, steps = at.model, at.z, steps + more
@@ -418,7 +419,7 @@ class Profile:
             moved = model.at(priors.values(z))
             now = _evaluate(moved, priors, z, self.data, weights, derivative, near)
             # The products of the rows that `free` would return.
-            H, g, cost = weights.normal_equations(now.J, now.e)
+            H, g, cost = weights.normal_equations(now.J, now.e, now.along)
             A, b = now.J @ self._white_basis, now.e @ self._white_basis + self.basis[:, len(now.e) :] @ rest
             return _Expansion(moved, z, now, H - A @ A.T, g - A @ b, cost + float(rest @ rest - b @ b))
 
@@ -474,7 +475,7 @@ def _evaluate(
         e[rows] = as_real(whitened(L, block.Y - found.Y)[None])[0]
         if derivative:
             np.multiply(whitened_real(L, found.dY), slopes, out=J[:, rows])
-    transients.remove_from(e[None])
-    transients.remove_from(J)
+    of_e, of_J = transients.remove_from(e[None]), transients.remove_from(J)
+    along = [np.concatenate(both) for both in zip(of_J, of_e, strict=True)]
     left = [np.linalg.solve(L[:, 0], as_complex(e[rows], block.Y.shape))[:, :, 0] for block, L, rows, _ in parts]
-    return Evaluated(e, J, left, transients)
+    return Evaluated(e, J, left, transients, along)

@@ -151,7 +151,8 @@ def identified(
     model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
 ) -> Priors:
     """Priors of the free parameters of a model: as stated (mean, standard deviation), otherwise about their present
-    values. The latter are so wide that they affect only combinations that the data do not determine."""
+    values. The latter keep combinations near these values that the data determine less well
+    (`unknown_percent`); they do not count as information."""
     mean, scale = model.values.copy(), model.scales()
     sigma = settings.unknown_percent / 100 * scale
     for name, (value, deviation) in stated.items():

@@ -74,25 +74,30 @@ class Transients:
             as_real(whitened(L, block.Y - model.answer(block, None, False).Y)[None])[0]
             for block, L in zip(blocks, whiteners, strict=True)
         ]
-        parts = found._parts(found._coefficients(np.concatenate(residuals)[None]))
+        e = np.concatenate(residuals)[None]
+        parts = found._parts(found._coefficients(e, [e[:, one.rows] @ one.Q for one in paths]))
         initial = tuple(
             transient_parts(one.X @ part[0], one.norms, block, model) if block.transient else (None, None)
             for one, part, block in zip(spans, parts, blocks, strict=True)
         )
         return replace(found, initial=initial)
 
-    def remove_from(self, x: np.ndarray) -> None:
-        """Subtract from whitened rows x (k, N) their most likely transients, in place."""
-        for Q, rows, part in zip(self.bases, self.rows, self._parts(self._coefficients(x)), strict=True):
+    def remove_from(self, x: np.ndarray) -> list[np.ndarray]:
+        """Subtract from whitened rows x (k, N) their most likely transients, in place; returns `Weights.along` of what
+        is left."""
+        along = [x[:, one.rows] @ one.Q for one in self.paths]
+        found = self._coefficients(x, along)
+        for Q, rows, part in zip(self.bases, self.rows, self._parts(found), strict=True):
             if Q.size:
                 x[:, rows] -= part @ Q.T
+        return [of_x - found @ T for of_x, T in zip(along, self.along, strict=True)]
 
-    def _coefficients(self, x: np.ndarray) -> np.ndarray:
-        """(k, r) most likely coefficients in the bases, of whitened rows (k, N)."""
-        along = np.concatenate([x[:, rows] @ Q for Q, rows in zip(self.bases, self.rows, strict=True)], axis=1)
-        for one, T in zip(self.paths, self.along, strict=True):
-            along -= ((x[:, one.rows] @ one.Q) * one.share) @ T.T
-        return np.asarray(along @ self.covariance)
+    def _coefficients(self, x: np.ndarray, along: Sequence[np.ndarray]) -> np.ndarray:
+        """(k, r) most likely coefficients in the bases, of whitened rows (k, N) with these `Weights.along`."""
+        found = np.concatenate([x[:, rows] @ Q for Q, rows in zip(self.bases, self.rows, strict=True)], axis=1)
+        for one, of_x, T in zip(self.paths, along, self.along, strict=True):
+            found -= (of_x * one.share) @ T.T
+        return np.asarray(found @ self.covariance)
 
     def _parts(self, x: np.ndarray) -> list[np.ndarray]:
         """Coefficients (k, r) by block."""

@@ -70,8 +70,9 @@ def mean_noise(
 
 
 def log_prior(variances: Variances, noise: Mapping[Group, np.ndarray], settings: FitSettings) -> float:
-    """Log prior of the variances up to a constant: flat in the logarithm, with an exponential decrease below the
-    minimum values. noise : (n_y,) mean variance by level and band (`mean_noise`)."""
+    """Log prior of the logarithms of the variances, inverse chi-square with the minimum values as scale, up to a
+    constant: it decreases as 1/v above them and exponentially below. noise : (n_y,) mean variance by level and band
+    (`mean_noise`)."""
     half = settings.error_weight / 2
     pairs = [(v, np.full(len(v), settings.least_error**2)) for v in variances.path.values()]
     pairs += [(variances.of_distortion(*group), settings.least_distortion * n) for group, n in noise.items()]

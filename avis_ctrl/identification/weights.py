@@ -66,14 +66,21 @@ class Weights:
             out[:, one.rows] = part - ((part @ one.Q) * (1 - 1 / np.sqrt(1 + one.size))) @ one.Q.T
         return out
 
-    def normal_equations(self, J: np.ndarray, e: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """J W J^T (n, n), J W e (n,) and e W e of whitened rows, W = inv(I + B B^T), without forming its root."""
+    def along(self, x: np.ndarray) -> list[np.ndarray]:
+        """(k, r) whitened rows x (k, N) times Q of each path error."""
+        return [x[:, one.rows] @ one.Q for one in self.paths]
+
+    def normal_equations(
+        self, J: np.ndarray, e: np.ndarray, along: Sequence[np.ndarray] | None = None
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """J W J^T (n, n), J W e (n,) and e W e of whitened rows, W = inv(I + B B^T), without forming its root. along :
+        `along` of the rows (J, e), if it is known."""
         H, g, cost = J @ J.T, J @ e, float(e @ e)
-        for one in self.paths:
-            along, of = J[:, one.rows] @ one.Q, one.Q.T @ e[one.rows]
-            H -= (along * one.share) @ along.T
-            g -= along @ (one.share * of)
-            cost -= float(one.share @ of**2)
+        for one, both in zip(self.paths, along or self.along(np.concatenate([J, e[None]])), strict=True):
+            of_J, of_e = both[:-1], both[-1]
+            H -= (of_J * one.share) @ of_J.T
+            g -= of_J @ (one.share * of_e)
+            cost -= float(one.share @ of_e**2)
         return H, g, cost
 
 

@@ -183,7 +183,7 @@ def test_friction_at_rest_is_stiffness_of_the_driven_mounts(rig, plain):
     made = realise(model)
     omega = made.omega
     assert differ(made.system.frequency_response(omega), stiffer.system.frequency_response(omega)) < 1e-9
-    assert "spring at every motor" in made.notes[0]
+    assert "spring at every drive" in made.notes[0]
 
 
 @pytest.mark.parametrize("when", [-0.5, 0.0, 0.5])

@@ -248,6 +248,8 @@ def _gap(
         return problem.ratios(dict(zip(names, values.tolist(), strict=True)))
 
     over_noise = np.nan if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300)))
+    # Without a measured noise, of the whole residual.
+    share = found.after / power(base) if problem.noise is None else found.remaining
     return AxisGap(
         problem.kind,
         kinds[closed],
@@ -255,7 +257,7 @@ def _gap(
         traces,
         tuple(stages),
         _where(best, problem),
-        Remainder(stages[-1].nrmse, over_noise, found.remaining),
+        Remainder(stages[-1].nrmse, over_noise, share),
         tuple(sentences),
         onward,
         _propagated(base_values, best.model.values, covariance, problem),
@@ -406,7 +408,8 @@ def _sentences(
         if one.rivals and one.effect.separated_by
     ]
     sentences.append(
-        "Nothing in these data repeats, so the noise cannot be estimated."
+        "Nothing in these data repeats, so the noise cannot be estimated: the residual may be noise or a missing "
+        "effect."
         if problem.noise is None
         else f"The residual of held-out data is {np.sqrt(stages[-1].chi2_per_dof):.3g} times the measured noise."
     )

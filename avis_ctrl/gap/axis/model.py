@@ -309,7 +309,8 @@ def sizes(model: AxisModel, at: Sequence[int]) -> np.ndarray:
 
 def added_priors(model: AxisModel, settings: AxisSettings = SETTINGS) -> Priors:
     """Priors of the parameters of a model's last effect, or of the base of a model without effects, about their initial
-    values. They are so wide that they have no influence: a factor of e, or as much as the whole response."""
+    values. They are so wide that they hardly move the estimate, but they count in the evidence: a factor of e, or as
+    much as the whole response."""
     names, parameters = model.names, model.base
     if model.effects:
         names, parameters = model.effects[-1].names, model.effects[-1].parameters

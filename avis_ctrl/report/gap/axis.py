@@ -33,8 +33,8 @@ def _summary(gap: AxisGap) -> Section:
         "finding",
         wording.verdict(f"Verdict: {gap.verdict}. {first}", gap.verdict),
         listed(
-            "Error of each model on data that no fit has used, r.m.s., relative to the measured signal. Each row "
-            "adds an effect to the model of the row above.",
+            "Error of each model on data that no fit has used, r.m.s., relative to the measured signal. These data "
+            "also helped to decide which effects are named. Each row adds an effect to the model of the row above.",
             gap.stages,
             {
                 "model": lambda one: wording.titled(one.name),
