@@ -118,6 +118,8 @@ def test_nothing_is_named_where_nothing_is_missing(seed, noise):
     gap = searched(lambda y, v: 0.0, seed, n=16_384, noise=noise)
     assert gap.verdict == "none" and not gap.effects and gap.remaining
     assert gap.sentences[0].startswith("No missing effect was found")
+    # Nothing repeats: the noise is unknown, and all of the base model's residual remains.
+    assert np.isnan(gap.left.over_noise) and gap.left.share == pytest.approx(1)
 
 
 @pytest.mark.slow
