@@ -1,7 +1,7 @@
 """Score test: the reduction of the residual by a small effect, beyond any re-identification.
 
 At the fitted model, the whitened residual e and its derivative J with respect to the rig's parameters are known, with
-the transients of the records projected out. An effect that changes the response by c delta along directions delta
+the transients of the records removed. An effect that changes the response by c delta along directions delta
 (whitened) lowers chi2 by at most
 
     b^T inv(A) b,   A = delta P delta^T,   b = delta P e,    P = I - J^T inv(J J^T) J
