@@ -277,7 +277,7 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
     for label, fitted in step.tried.items():
         if name_of(label) in known or mine - fitted.log_evidence > later:
             continue
-        one = with_effect(begun, fitted.model.effects[-1], data, settings.quick)
+        one = with_effect(begun, fitted.model.effects[-1], data, settings)
         if one is not None:
             tried[label] = one.bare()
     return Step(rest.bare(), best.bare(), tried, step.candidates, step.label)
@@ -303,9 +303,16 @@ def next_effect_from(
 
 
 def _with_best(now: Fitted, tried: dict[str, Fitted], count: int, data: Data, settings: GapSettings) -> Step:
-    """The step with the effect of the largest evidence, fitted to the end."""
-    best = tried[_likeliest(tried, settings)]
-    return Step(now.bare(), fit(best.model, best.priors, best.z, data, best.variances, settings), tried, count)
+    """The step with the effect of the largest evidence, fitted to the end together with all that are near it."""
+    best = _likeliest(tried, settings)
+    least = tried[best].log_evidence - settings.near_tie
+    ended = {
+        label: fit(one.model, one.priors, one.z, data, one.variances, settings)
+        for label, one in tried.items()
+        if one.log_evidence >= least
+    }
+    best = _likeliest(ended, settings)
+    return Step(now.bare(), ended[best], tried | {label: one.bare() for label, one in ended.items()}, count)
 
 
 def _compared(

@@ -126,7 +126,7 @@ class SensorLate(OfSensor, Late):
 
 
 class MotorLate(Late):
-    """One motor is later than the others: a lag or a delay of its own amplifier."""
+    """One drive is later than the others: a lag or a delay of its own amplifier."""
 
     name = "motor_late"
 
