@@ -287,11 +287,11 @@ def _borne_out(best: Fitted, step: Step, data: Data, held: Data, settings: GapSe
     """Whether an effect makes held-out records more likely: when it was found or, failing that, together with all
     effects found later. A weak effect may not show while a stronger one is missing."""
 
-    priors = 0.5 * has_tolerance(best.model.effect(step.label), tolerances_of(best.model.rig))
+    counted = has_tolerance(best.model.effect(step.label), tolerances_of(best.model.rig))
 
     def likelihood(one: Fitted) -> float:
         # A value beyond its tolerance shows in how far other values had to move, hardly in a residual.
-        return log_likelihood(one, held, settings) - priors * float(one.z @ one.z)
+        return log_likelihood(one, held, settings) - 0.5 * counted * float(one.z @ one.z)
 
     if likelihood(step.fitted) > likelihood(step.before):
         return True

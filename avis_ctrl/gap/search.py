@@ -303,7 +303,7 @@ def next_effect_from(
 
 
 def _with_best(now: Fitted, tried: dict[str, Fitted], count: int, data: Data, settings: GapSettings) -> Step:
-    """The step with the effect of the largest evidence, fitted to the end together with all that are near it."""
+    """The step with the effect of the largest evidence. The candidates near the best are fitted to the end."""
     best = _likeliest(tried, settings)
     least = tried[best].log_evidence - settings.near_tie
     ended = {

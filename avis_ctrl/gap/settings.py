@@ -52,8 +52,8 @@ class GapSettings(FitSettings):
         parameters has failed [1]: the fit of all parameters then starts from the seed, too.
     quick_rounds, quick_iterations, quick_converged : `rounds`, `iterations` and `converged` of a fit that only compares
         candidates, or gives the residual of a stage.
-    near_tie : difference of log evidence [nats] up to which candidates are compared by fits to the end: these have
-        raised the log evidence by up to 170, that of similar candidates by about as much.
+    near_tie : difference of log evidence [nats] up to which candidates are compared by fits to the end: such a fit
+        raised the log evidence by up to 170, but by similar amounts for similar candidates.
     longest : maximum number of effects named together.
     revisions : how often an effect may be replaced by a rival that is better given the effects found later; twice, for
         a pair that was named wrongly both times.

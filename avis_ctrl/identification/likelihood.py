@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.clusters import Robust, cluster_moves, clusterings
+from avis_ctrl.identification.clusters import ClusterCovariance, cluster_moves, clusterings
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import (
     as_complex,
@@ -151,24 +151,24 @@ class Fitted:
         """(n,) standard deviations of z, as those of `covariance_of`."""
         variance = self.weight_cost * np.diag(self.covariance)
         for robust in self._by_clusters:
-            variance = variance + robust.factor * np.maximum(np.diag(robust.covariance) - variance, 0.0)
+            variance = variance * robust.widening(np.diag(robust.covariance) / variance)
         return np.sqrt(variance)
 
     @cached_property
-    def _by_clusters(self) -> list[Robust]:
+    def _by_clusters(self) -> list[ClusterCovariance]:
         """Covariances of z from the differences of octaves and of levels; none for a fit without its residual, or with
         one cluster."""
         if not len(self.white.e):
             return []
         J = self.J
 
-        def robust(clusterings: Sequence[Sequence[Sequence[Group]]]) -> Robust:
+        def robust(divisions: Sequence[Sequence[Sequence[Group]]]) -> ClusterCovariance:
             found = []
-            for parts in clusterings:
+            for parts in divisions:
                 rows = [np.concatenate([self.weights.rows[group] for group in part]) for part in parts]
                 moves = cluster_moves(self.covariance, J, self.e, rows, self.settings.least_elsewhere)
                 found.append(self.covariance @ self.covariance + moves.T @ moves)
-            return Robust(np.mean(found, axis=0), float(np.mean([len(parts) for parts in clusterings])))
+            return ClusterCovariance(np.mean(found, axis=0), float(np.mean([len(parts) for parts in divisions])))
 
         by_octave, by_level = clusterings(list(self.weights.rows), self.settings.bands_per_octave)
         several = [[parts for parts in one if len(parts) > 1] for one in (by_octave, [by_level])]

@@ -151,8 +151,8 @@ def identified(
     model: ResponseModel, stated: Mapping[str, tuple[float, float]], settings: FitSettings = SETTINGS
 ) -> Priors:
     """Priors of the free parameters of a model: as stated (mean, standard deviation), otherwise about their present
-    values. The latter keep combinations near these values that the data determine less well
-    (`unknown_percent`); they do not count as information."""
+    values. The latter keep combinations that the data determine poorly near these values (`unknown_percent`); they
+    do not count as information."""
     mean, scale = model.values.copy(), model.scales()
     sigma = settings.unknown_percent / 100 * scale
     for name, (value, deviation) in stated.items():

@@ -32,8 +32,8 @@ class Transients:
 
     bases : Q (N_b, r_b) per block, orthonormal whitened transients. rows : of each block in the stacked real residual.
     initial : body and inner initial values per block, as in `transient_parts`; None for a block without a transient.
-    paths : path errors. along : (r, k) transients times Q of each path error. covariance : (r, r)
-        inverse of T W T^T. price : decrease of the log-likelihood if x is integrated out.
+    paths : path errors. along : (r, k) transients times Q of each path error. covariance : (r, r) inverse of T W T^T.
+    price : decrease of the log-likelihood if x is integrated out.
 
     With a fixed basis the gradient is exact. `block_residual` leaves out that its basis depends on the parameters (L.
     Kaufman, BIT 15 (1975) 49-57); its gradient is exact with its own weights only.
@@ -75,7 +75,7 @@ class Transients:
             for block, L in zip(blocks, whiteners, strict=True)
         ]
         e = np.concatenate(residuals)[None]
-        parts = found._parts(found._coefficients(e, [e[:, one.rows] @ one.Q for one in paths]))
+        parts = found._parts(found._coefficients(e, [one.along(e) for one in paths]))
         initial = tuple(
             transient_parts(one.X @ part[0], one.norms, block, model) if block.transient else (None, None)
             for one, part, block in zip(spans, parts, blocks, strict=True)
@@ -85,7 +85,7 @@ class Transients:
     def remove_from(self, x: np.ndarray) -> list[np.ndarray]:
         """Subtract from whitened rows x (k, N) their most likely transients, in place; returns `Weights.along` of what
         is left."""
-        along = [x[:, one.rows] @ one.Q for one in self.paths]
+        along = [one.along(x) for one in self.paths]
         found = self._coefficients(x, along)
         for Q, rows, part in zip(self.bases, self.rows, self._parts(found), strict=True):
             if Q.size:

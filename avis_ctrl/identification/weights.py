@@ -38,6 +38,10 @@ class PathError:
         """(r,) fraction of the power along Q that the inverse covariance leaves out."""
         return self.size / (1 + self.size)
 
+    def along(self, x: np.ndarray) -> np.ndarray:
+        """(k, r) whitened rows x (k, N) times Q."""
+        return np.asarray(x[:, self.rows] @ self.Q)
+
 
 @dataclass(frozen=True, eq=False)
 class Weights:
@@ -67,8 +71,8 @@ class Weights:
         return out
 
     def along(self, x: np.ndarray) -> list[np.ndarray]:
-        """(k, r) whitened rows x (k, N) times Q of each path error."""
-        return [x[:, one.rows] @ one.Q for one in self.paths]
+        """`PathError.along` of each path error."""
+        return [one.along(x) for one in self.paths]
 
     def normal_equations(
         self, J: np.ndarray, e: np.ndarray, along: Sequence[np.ndarray] | None = None

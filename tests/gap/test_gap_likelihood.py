@@ -21,7 +21,7 @@ from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
 from avis_ctrl.gap.validation import by_information, change_from, halves
-from avis_ctrl.identification.clusters import Robust, cluster_moves, clusterings
+from avis_ctrl.identification.clusters import ClusterCovariance, cluster_moves, clusterings
 from avis_ctrl.identification.fit_settings import SETTINGS
 from avis_ctrl.identification.likelihood import Data, descent, first_variances, fit
 from avis_ctrl.identification.maximum_likelihood import (
@@ -585,12 +585,14 @@ def test_a_covering_covariance_is_no_smaller_in_any_direction():
     for k in (1, 3, 5):
         X, few = rng.standard_normal((k, k + 2)), rng.standard_normal((k, 2))
         A, B = X @ X.T, few @ few.T
-        C = Robust(B, 3).covering(A, range(k))
+        C = ClusterCovariance(B, 3).covering(A, range(k))
         for one in (A, B):
             assert np.min(np.linalg.eigvalsh(C - one)) > -1e-9 * np.max(C)
-        assert_allclose(Robust(0.5 * A, 3).covering(A, range(k)), A, rtol=1e-9)
+        assert_allclose(ClusterCovariance(0.5 * A, 3).covering(A, range(k)), A, rtol=1e-9)
         # Student's t with two degrees of freedom: 4.303 instead of 1.960.
-        assert_allclose(Robust(3 * A, 3).covering(A, range(k)), (1 + 2 * (4.303 / 1.960) ** 2) * A, rtol=1e-3)
+        assert_allclose(
+            ClusterCovariance(3 * A, 3).covering(A, range(k)), (1 + 2 * (4.303 / 1.960) ** 2) * A, rtol=1e-3
+        )
 
 
 @pytest.mark.parametrize("clusters", [2, 3, 6])
@@ -606,7 +608,7 @@ def test_intervals_from_a_few_clusters_contain_the_truth(clusters, scatter):
         y = np.repeat(own, n) * J[0] + rng.standard_normal(clusters * n)
         z = P @ (J @ y)
         moves = cluster_moves(P, J, y - z @ J, rows)
-        variance = Robust(P @ P + moves.T @ moves, clusters).covering(P, [0])[0, 0]
+        variance = ClusterCovariance(P @ P + moves.T @ moves, clusters).covering(P, [0])[0, 0]
         inside += abs(z[0]) < 1.96 * np.sqrt(variance)
     assert 0.83 < inside / draws < 0.99
 

@@ -248,8 +248,8 @@ def _gap(
         return problem.ratios(dict(zip(names, values.tolist(), strict=True)))
 
     over_noise = np.nan if problem.noise is None else float(np.sqrt(found.after / max(problem.noise, 1e-300)))
-    # Without a measured noise, of the whole residual.
-    share = found.after / power(base) if problem.noise is None else found.remaining
+    # If the noise is unknown, it is the fraction of the whole residual.
+    share = found.after / stages[0].nrmse ** 2 if problem.noise is None else found.remaining
     return AxisGap(
         problem.kind,
         kinds[closed],

@@ -46,7 +46,7 @@ class Late(UnnamedFault):
     words = "a lag or a delay of {place} alone"
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        what = "motor" if place in model.actuators else "sensor"
+        what = "drive" if place in model.actuators else "sensor"
         return (
             EffectParameter("delay_s", "s", f"delay of this {what} beside the others", 0.0, 0.0, 0.1, 1e-3),
             EffectParameter("time_constant_s", "s", f"first-order lag of this {what} alone", 0.0, 0.0, 0.3, 1e-3),
