@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from avis_ctrl.errors import ComputationError, InputError
@@ -94,9 +96,29 @@ def _ignored_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
+def _reach(address: str, patience_s: float) -> None:
+    """Open and close a connection to the scheduler; raises what `distributed.Client` would raise.
+
+    A client that cannot connect leaves its event loop running and closes itself when it is collected. If that happens
+    while another client starts, both wait for the same lock for ever: so none is made for an address without an answer.
+    """
+
+    async def reach() -> None:
+        import distributed
+
+        core: Any = distributed.core  # without types
+        comm = await core.connect(address, timeout=patience_s)
+        await comm.close()
+
+    # In a thread of its own: a notebook already runs an event loop in this one.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, reach()).result()
+
+
 @contextlib.contextmanager
 def _connected(client_of: Any, address: str, patience_s: float) -> Iterator[Any]:
     try:
+        _reach(address, patience_s)
         client = client_of(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError, ImportError) as error:
         raise InputError(

@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -218,8 +219,10 @@ def test_no_scheduler_and_no_worker_are_one_line(tmp_path):
     soon = SweepSettings(patience_s=0.5)
     with pytest.raises(InputError, match=r"--scheduler = 'tcp://127\.0\.0\.1:9': expected the address of a dask"):
         list(on_cluster([], "tcp://127.0.0.1:9", 0, soon))
+    assert "IO loop" not in {thread.name for thread in threading.enumerate()}, "a client is still open"
     with pytest.raises(InputError, match="--scheduler = 'nonsense'"):
         list(on_cluster([], "nonsense", 0, soon))
+    assert "IO loop" not in {thread.name for thread in threading.enumerate()}, "a client is still open"
 
 
 def test_a_scheduler_without_workers_is_one_line():

@@ -241,7 +241,8 @@ def _channels(
     found = {driven: record.u[:, 0]} if driven else {}
     found |= {role: record.y[:, k] for k, role in enumerate(measured)}
     time = np.arange(source.header.samples) / source.header.sample_rate_Hz
-    found = {role: scale.get(role, 1.0) * values for role, values in found.items()}
+    with np.errstate(over="ignore"):  # refused below
+        found = {role: scale.get(role, 1.0) * values for role, values in found.items()}
     for role, values in found.items():
         if not np.all(np.isfinite(values)):  # the record's own samples are finite
             field = f"scale of {role}"
