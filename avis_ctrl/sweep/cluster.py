@@ -74,7 +74,7 @@ def on_cluster(
                     )
                 )
             address = cluster.scheduler_address
-        client = stack.enter_context(_connected(library.Client, address, settings.patience_s))
+        client = stack.enter_context(_connected(library, address, settings.patience_s))
         # Tasks are named by their identity: a resumed sweep joins tasks that are still running.
         by_name = {f"avis-sweep-{os.fspath(task.folder)}-{task.identity}": task for task in tasks}
         futures = [client.submit(perform, task, key=name) for name, task in by_name.items()]
@@ -96,18 +96,17 @@ def _ignored_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _reach(address: str, patience_s: float) -> None:
+def _reach(library: Any, address: str, patience_s: float) -> None:
     """Open and close a connection to the scheduler; raises what `distributed.Client` would raise.
 
-    A client that cannot connect leaves its event loop running and closes itself when it is collected. If that happens
-    while another client starts, both wait for the same lock for ever: so none is made for an address without an answer.
+    A client that cannot connect leaves its event loop running and closes itself when it is garbage-collected. If that
+    happens while another client starts, both wait for the same lock forever. So no client is made for an address that
+    does not respond.
     """
 
     async def reach() -> None:
-        import distributed
-
-        core: Any = distributed.core  # without types
-        comm = await core.connect(address, timeout=patience_s)
+        tls = library.Security().get_connection_args("client")  # from the library's configuration, as in a client
+        comm = await library.core.connect(address, timeout=patience_s, **tls)
         await comm.close()
 
     # In a thread of its own: a notebook already runs an event loop in this one.
@@ -116,10 +115,10 @@ def _reach(address: str, patience_s: float) -> None:
 
 
 @contextlib.contextmanager
-def _connected(client_of: Any, address: str, patience_s: float) -> Iterator[Any]:
+def _connected(library: Any, address: str, patience_s: float) -> Iterator[Any]:
     try:
-        _reach(address, patience_s)
-        client = client_of(address, timeout=patience_s, set_as_default=False)
+        _reach(library, address, patience_s)
+        client = library.Client(address, timeout=patience_s, set_as_default=False)
     except (OSError, ValueError, TypeError, KeyError, ImportError) as error:
         raise InputError(
             f"expected the address of a dask scheduler, such as tcp://HOST:8786 "
