@@ -176,7 +176,9 @@ def predict(
             noise = "" if one.noise is None else f"{100 * one.noise:.3g} %"
             rows.append((one.record, *(f"{100 * one.relative[name]:.3g} %" for name in names), *[noise] * noisy))
         title = "r.m.s. error relative to measured y; each record is predicted from rest"
-        terminal.table(("record", *names, *["noise between periods"] * noisy), rows, title=title)
+        terminal.table(("record", *names, *["noise"] * noisy), rows, title=title)
+        if noisy:
+            terminal.print("noise: differences between the periods, or a record at rest; it cannot be predicted from u")
         if note := compared(errors):
             terminal.print(note)
     terminal.print(f"{out}: {len(measured.records)} records")

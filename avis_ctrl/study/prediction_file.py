@@ -19,8 +19,9 @@ class PredictionErrors:
     They are the r.m.s. error over the r.m.s. of the measured y, both about their means, and the root mean square over
     the channels.
 
-    noise : the same for the differences between the periods of a periodic record after the first one, which no
-        prediction from u can contain; None if the record has fewer than two such periods, or its floor was measured.
+    noise : the same for signals that no prediction from u can contain: the differences between the periods of a
+        periodic record after the first one, or else the signals of the campaign's records at rest. None if the floor
+        was measured, or if there are neither two such periods nor a record at rest.
     """
 
     record: str
@@ -30,6 +31,8 @@ class PredictionErrors:
 
 def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[PredictionErrors]:
     """Errors of every record of a campaign with nonzero signals on all channels, from a file of its predictions."""
+    rest = [source.load() for source in campaign.records if source.header.excitation == "rest"]
+    variances = [np.var(record.y, axis=0) for record in rest if record.floor is None]
     with h5py.File(predicted, "r") as file:
         for source in campaign.records:
             record = source.load()
@@ -40,7 +43,7 @@ def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[Predictio
                 yield PredictionErrors(
                     source.header.name,
                     {name: _relative(data[()] - y, size) for name, data in group.items()},
-                    _noise(record, size),
+                    _noise(record, size, variances),
                 )
 
 
@@ -48,14 +51,17 @@ def _relative(error: np.ndarray, size: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.var(error, axis=0) / size**2)))
 
 
-def _noise(record: Record, size: np.ndarray) -> float | None:
-    period, count = record.header.period_samples, record.header.periods - 1
-    if not period or count < 2 or record.floor is not None:  # the response to a measured floor is predicted
+def _noise(record: Record, size: np.ndarray, rest: Sequence[np.ndarray]) -> float | None:
+    """rest : variances of the sensor signals of the records at rest."""
+    if record.floor is not None:  # the response to a measured floor is predicted
         return None
-    y = record.y[period : (count + 1) * period].reshape(count, period, -1)
-    spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
-    # Subtracting the mean removes 1/count of the noise power.
-    return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
+    period, count = record.header.period_samples, record.header.periods - 1
+    if period and count >= 2:
+        y = record.y[period : (count + 1) * period].reshape(count, period, -1)
+        spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
+        # Subtracting the mean removes 1/count of the noise power.
+        return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
+    return float(np.sqrt(np.mean(np.mean(rest, axis=0) / size**2))) if rest else None
 
 
 def compared(errors: Sequence[PredictionErrors]) -> str:

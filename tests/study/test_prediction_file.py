@@ -63,5 +63,23 @@ def test_noise_is_what_differs_between_the_periods_after_the_first(tmp_path):
     assert one.noise == pytest.approx(one.relative["y"], rel=0.05)
 
 
-def test_no_noise_is_told_where_nothing_repeats(predicted):
+def test_without_periods_or_a_record_at_rest_there_is_no_noise(predicted):
     assert all(one.noise is None for one in prediction_errors(*predicted))
+
+
+def test_noise_of_a_record_without_periods_is_that_at_rest(predicted):
+    """Two records at rest, of 3 % and 4 % of the signals of the others in each channel: their power is averaged."""
+    path, campaign = predicted
+    rng, size = np.random.default_rng(3), np.std(campaign.records[0].y, axis=0)
+    rest = []
+    with h5py.File(path, "r+") as file:
+        for name, part in (("02", 0.03), ("03", 0.04)):
+            header = RecordHeader(name, 1000.0, 4000, ("u1",), ("Sy1", "Sz1"), "rest")
+            y = rng.standard_normal((4000, 2)) * part * size
+            rest.append(Record(header, np.zeros((4000, 1)), y, None))
+            file[f"records/{name}/y_baseline"] = np.zeros_like(y)
+    found = list(prediction_errors(path, Campaign("avis", (*campaign.records, *rest))))
+    assert found[0].noise == pytest.approx(np.sqrt((0.03**2 + 0.04**2) / 2), rel=0.03)
+    # A prediction of zero leaves the whole signal of a record at rest.
+    assert found[2].relative["y_baseline"] == pytest.approx(1.0)
+    assert found[2].noise == pytest.approx(np.sqrt((0.03**2 + 0.04**2) / 2) / 0.03, rel=0.03)
