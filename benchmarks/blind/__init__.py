@@ -4,5 +4,5 @@
     python -m benchmarks.blind.score blind.jsonl [--markdown blind.md] [--png blind.png]
 
 Both from the root of the repository. The first takes hours and may be killed and resumed; the second also
-draws the confusion matrix, beside the lines. `seed_91000.jsonl.gz` has the lines for the table in docs/gap_engine.md.
+draws the confusion matrix, beside the lines. `seed_93000.jsonl.gz` has the lines for the table in docs/gap_engine.md.
 """
