@@ -178,7 +178,7 @@ def predict(
         title = "r.m.s. error relative to measured y; each record is predicted from rest"
         terminal.table(("record", *names, *["noise"] * noisy), rows, title=title)
         if noisy:
-            terminal.print("noise: differences between the periods, or a record at rest; it cannot be predicted from u")
+            terminal.print("noise, which cannot be predicted: differences between periods, or else the records at rest")
         if note := compared(errors):
             terminal.print(note)
     terminal.print(f"{out}: {len(measured.records)} records")

@@ -31,8 +31,8 @@ class PredictionErrors:
 
 def prediction_errors(predicted: Path, campaign: Campaign) -> Iterator[PredictionErrors]:
     """Errors of every record of a campaign with nonzero signals on all channels, from a file of its predictions."""
-    rest = [source.load() for source in campaign.records if source.header.excitation == "rest"]
-    variances = [np.var(record.y, axis=0) for record in rest if record.floor is None]
+    rest = [one for one in campaign.records if one.header.excitation == "rest" and not one.header.floor_names]
+    variances = [np.var(one.load().y, axis=0) for one in rest]
     with h5py.File(predicted, "r") as file:
         for source in campaign.records:
             record = source.load()
@@ -51,8 +51,8 @@ def _relative(error: np.ndarray, size: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.var(error, axis=0) / size**2)))
 
 
-def _noise(record: Record, size: np.ndarray, rest: Sequence[np.ndarray]) -> float | None:
-    """rest : variances of the sensor signals of the records at rest."""
+def _noise(record: Record, size: np.ndarray, at_rest: Sequence[np.ndarray]) -> float | None:
+    """at_rest : variances of the sensor signals, one array for each record at rest."""
     if record.floor is not None:  # the response to a measured floor is predicted
         return None
     period, count = record.header.period_samples, record.header.periods - 1
@@ -61,7 +61,7 @@ def _noise(record: Record, size: np.ndarray, rest: Sequence[np.ndarray]) -> floa
         spread = (y - y.mean(axis=0)).reshape(-1, y.shape[2])
         # Subtracting the mean removes 1/count of the noise power.
         return _relative(spread, size) * float(np.sqrt(count / (count - 1)))
-    return float(np.sqrt(np.mean(np.mean(rest, axis=0) / size**2))) if rest else None
+    return float(np.sqrt(np.mean(np.mean(at_rest, axis=0) / size**2))) if at_rest else None
 
 
 def compared(errors: Sequence[PredictionErrors]) -> str:
