@@ -257,12 +257,15 @@ def _log_volume(at: _Expansion, priors: Priors) -> float:
 
     A normal distribution with the curvature of the expansion, at a bound also with its gradient, is integrated between
     the bounds of each parameter; the others follow to first order, and different parameters are taken as independent.
+    A gradient that points away from the bound is ignored: the fit ended early, and the maximum that the expansion
+    predicts inside has not been reached.
     """
     H, (low, high) = at.H + np.eye(len(at.z)), priors.bounds
     bounded = np.isfinite(low) | np.isfinite(high)
     std = np.sqrt(np.diag(np.linalg.inv(H))[bounded])
     outward = (at.z - at.g)[bounded] * std  # gradient of half the sum of squares, zero within the bounds
-    outward = np.where((at.z <= low)[bounded] | (at.z >= high)[bounded], outward, 0.0)
+    at_low, at_high = (at.z <= low)[bounded], (at.z >= high)[bounded]
+    outward = np.where(at_low, np.maximum(outward, 0.0), np.where(at_high, np.minimum(outward, 0.0), 0.0))
     below, above = ((end - at.z)[bounded] / std + outward for end in (low, high))
     # log(Phi(above) - Phi(below)) on the side where both are small.
     below, above = np.where(below > 0, -above, below), np.where(below > 0, -below, above)

@@ -664,6 +664,37 @@ class OneParameter:
         return np.zeros((len(block.omega), 1, 1), complex)
 
 
+@dataclass(frozen=True, eq=False)
+class Saturating(OneParameter):
+    """y = tanh(a) x on each line."""
+
+    def answer(self, block, body=None, derivative=True, inner=None):
+        size = np.tanh(self.values[0])
+        return Driven((self.x * size)[:, None, None], (self.x * (1 - size**2))[None, :, None, None])
+
+
+def fit_of_one(model, estimate, size, low, high, settings):
+    """A fit without path errors and with a noise variance of 1; the response `estimate` x was measured."""
+    lines = len(model.x)
+    omega = 2 * np.pi * np.geomspace(1, 50, lines)
+    empty = SpectralBlock("a", omega, np.zeros((lines, 0, 1)), estimate * model.x[:, None, None])
+    data = Data((empty.with_noise(np.ones((lines, 1, 1), complex)),), (1.0,))
+    first = first_variances(data, settings)
+    none = Variances(
+        {band: np.full_like(v, 1e-12) for band, v in first.path.items()},
+        {group: np.full_like(s, 1e-12) for group, s in first.distortion.items()},
+    )
+    priors = Priors(("a",), np.zeros(1), np.array([size]), np.zeros(1, bool), np.array([low]), np.array([high]))
+    return fit(model, priors, np.zeros(1), data, none, settings)
+
+
+def unit_columns(lines: int = 40) -> np.ndarray:
+    """(lines,) complex, for which a coefficient has a standard deviation of 1."""
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal(lines) + 1j * rng.standard_normal(lines)
+    return np.asarray(x / (np.sqrt(2) * np.linalg.norm(x)))
+
+
 @pytest.mark.parametrize(
     ("estimate", "low", "high"),
     [
@@ -679,22 +710,10 @@ class OneParameter:
 )
 def test_evidence_within_bounds(estimate, low, high):
     """Of one linear parameter with a standard deviation of 1 and a prior of 10, against quadrature."""
-    rng = np.random.default_rng(6)
-    x = rng.standard_normal(40) + 1j * rng.standard_normal(40)
-    x /= np.sqrt(2) * np.linalg.norm(x)
-    omega = 2 * np.pi * np.geomspace(1, 50, 40)
-    empty = SpectralBlock("a", omega, np.zeros((40, 0, 1)), estimate * x[:, None, None])
-    one = empty.with_noise(np.ones((40, 1, 1), complex))
-    data, settings = Data((one,), (1.0,)), replace(SETTINGS, rounds=0, converged=1e-12)
-    first = first_variances(data, settings)
-    none = Variances(
-        {band: np.full_like(v, 1e-12) for band, v in first.path.items()},
-        {group: np.full_like(s, 1e-12) for group, s in first.distortion.items()},
-    )
+    model, settings = OneParameter(unit_columns(), np.zeros(1)), replace(SETTINGS, rounds=0, converged=1e-12)
 
     def evidence(size, low, high):
-        priors = Priors(("a",), np.zeros(1), np.array([size]), np.zeros(1, bool), np.array([low]), np.array([high]))
-        return fit(OneParameter(x, np.zeros(1)), priors, np.zeros(1), data, none, settings).log_evidence
+        return fit_of_one(model, estimate, size, low, high, settings).log_evidence
 
     def density(a):
         return np.exp(a * estimate - a * a / 2) * stats.norm.pdf(a / 10) / 10
@@ -703,6 +722,15 @@ def test_evidence_within_bounds(estimate, low, high):
     ends = max(low, -60), min(high, 60)
     exact = np.log(integrate.quad(density, *ends, points=[np.clip(estimate, *ends)], limit=400)[0] / volume)
     assert evidence(10.0, low, high) - evidence(1e-9, -np.inf, np.inf) == pytest.approx(exact, abs=1e-3)
+
+
+def test_evidence_of_a_fit_that_ended_early_at_a_bound_does_not_count_a_maximum_that_it_has_not_reached():
+    """At the bound, the slope of tanh predicts that a coefficient of 50 can be reached; the largest is 1."""
+    model, settings = Saturating(unit_columns(), np.zeros(1)), replace(SETTINGS, rounds=0)
+    early, whole = (
+        fit_of_one(model, 50.0, 10.0, 0.0, 5.0, replace(settings, iterations=most)).log_evidence for most in (0, 50)
+    )
+    assert early < whole
 
 
 def test_priors_are_normalised_inside_their_bounds():
