@@ -313,19 +313,37 @@ class Assembled:
         g = np.broadcast_to(ops.stiffness_factor, self.z_pp.shape)[:, inside] + 2 * ops.internal_damping[inside] * s / w
         return inside, g * (1 - share) / (g + (s / w) ** 2)
 
+    @cached_property
+    def _state_counts(self) -> tuple[int, ...]:
+        """Numbers of initial states of each kind, in the order of `forces_of_states`: impulses on modes, masses inside
+        mounts, chassis and states defined by effects; steps on the same; first-order states."""
+        ops, chassis = self.ops, 0 if self.ops.recoil is None else self._moves.shape[2]
+        by_effects, decays = (sum(one.shape[2] for one in states) for states in (ops.inner, ops.decays))
+        impulses = (self.n_q - N_Q, len(self._masses_inside[0]), chassis, by_effects)
+        return (*impulses, *impulses, decays)
+
+    def _by_kind(self, inner: np.ndarray) -> list[np.ndarray]:
+        """Initial states (m,) by the kinds of `_state_counts`."""
+        return np.split(inner, np.cumsum(self._state_counts)[:-1])
+
+    def states_of(self, fewer: Assembled, inner: np.ndarray) -> np.ndarray:
+        """(m,) initial states (`forces_of_states`) of a table without the effect that was added last, in the order of
+        this one; zero for the states of that effect."""
+        return np.concatenate(
+            [
+                np.pad(own, (0, count - len(own)))
+                for own, count in zip(fewer._by_kind(inner), self._state_counts, strict=True)
+            ]
+        )
+
     def push_of_masses_inside(self, inner: np.ndarray) -> np.ndarray:
         """(n, n_g, 1) force of the mounts on the payload due to the initial states of the masses inside them
         (`forces_of_states`)."""
         inside, by_mass = self._masses_inside
-        first = self.n_q - N_Q
-        impulse, step = (inner[k + first : k + first + len(inside)] for k in (0, self._impulses(inner)))
+        _, impulse, _, _, _, step, *_ = self._by_kind(inner)
         found = np.zeros((len(by_mass), len(self.G), 1), complex)
         found[:, inside, 0] = by_mass * (impulse + self.ops.s[:, None] * step)
         return found
-
-    def _impulses(self, inner: np.ndarray) -> int:
-        """Number of impulses, and of steps, among the initial states of `forces_of_states`."""
-        return (len(inner) - sum(one.shape[2] for one in self.ops.decays)) // 2
 
     @property
     def _moves(self) -> np.ndarray:
@@ -335,13 +353,9 @@ class Assembled:
 
     def _chassis_states(self, inner: np.ndarray) -> np.ndarray:
         """(n, 6, 1) chassis displacement due to the chassis' own part of the initial states of `forces_of_states`."""
-        ops, moves = self.ops, self._moves
-        n_impulses = self._impulses(inner)
-        first = n_impulses - sum(one.shape[2] for one in ops.inner) - moves.shape[2]
-        own = slice(first, first + moves.shape[2])
-        return (moves @ inner[:n_impulses][own])[:, :, None] + ops.s[:, None, None] * (moves @ inner[n_impulses:][own])[
-            :, :, None
-        ]
+        moves = self._moves
+        _, _, impulse, _, _, _, step, *_ = self._by_kind(inner)
+        return (moves @ impulse)[:, :, None] + self.ops.s[:, None, None] * (moves @ step)[:, :, None]
 
     def floor_force(self, w: np.ndarray) -> np.ndarray:
         """(n, n_q, m) force due to floor displacement w (n, 3, m)."""

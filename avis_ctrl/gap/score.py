@@ -21,7 +21,7 @@ import numpy as np
 
 from avis_ctrl.gap.operators import Assembled
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel
-from avis_ctrl.gap.table_response import Acting, AtMotion, TableResponse
+from avis_ctrl.gap.table_response import AtMotion, TableResponse
 from avis_ctrl.identification.fit_settings import SETTINGS as FIT_SETTINGS
 from avis_ctrl.identification.fit_settings import FitSettings
 from avis_ctrl.identification.likelihood import Data, Fitted, Profile
@@ -98,20 +98,16 @@ def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
 class Part:
     """One block at the model: its response with the initial values of its transient.
 
-    body : (n, 12, 1) impulses and steps of the transient in the data; an effect changes the response to them, too.
-    inner : (m,) initial internal states, for derivatives with respect to the model's own parameters.
+    body : (n, 12, 1) impulses and steps of the transient in the data. inner : (m,) initial internal states. An effect
+    changes the response to both, which may be large and nearly cancel each other.
     """
 
     def __init__(self, model: TableModel, block: SpectralBlock, body: np.ndarray | None, inner: np.ndarray | None):
         self.model, self.block, self.body, self.inner = model, block, body, inner
         self.L = whitener(block)
         self.made = model.assembled(block.omega)
-        self.response = TableResponse(self.made, self._acting(model))
-
-    def _acting(self, model: TableModel) -> Acting:
-        block = self.block
-        U = block.U if self.body is None else np.concatenate([block.U, self.body], axis=1)
-        return model.acting(U, block if model.nonlinear else None)
+        U = block.U if body is None else np.concatenate([block.U, body], axis=1)
+        self.response = TableResponse(self.made, model.acting(U, block if model.nonlinear else None, inner))
 
     @property
     def s(self) -> np.ndarray:
@@ -128,8 +124,18 @@ class Part:
         if effect.effect.nonlinear:
             return TableResponse(self.made, self.model.contribution(effect, self.block)).Y
         changed = Assembled(self.model.with_effect(effect).operators(self.block.omega))
-        side = AtMotion(changed, response.acting, response.x)
+        side = AtMotion(changed, replace(response.acting, inner=self._states_in(changed)), response.x)
         return side.Y - response.Y + response.left @ side.push
+
+    def whole_change(self, effect: ActiveEffect) -> np.ndarray:
+        """(n, n_y, m) change of y by an effect at full strength."""
+        added = self.model.with_effect(effect)
+        inner = self._states_in(added.assembled(self.block.omega))
+        return added.answer(self.block, self.body, False, inner).Y - self.response.Y
+
+    def _states_in(self, changed: Assembled) -> np.ndarray | None:
+        """(m,) initial internal states in the order of a table with one more effect."""
+        return None if self.inner is None else changed.states_of(self.made, self.inner)
 
     def by_impedance(self, dynamic: np.ndarray) -> np.ndarray:
         """(21, n, n_y, m): y per symmetric unit impedance on q, times dynamic (n,) [dynamic stiffness]."""
@@ -204,8 +210,7 @@ class Score:
         """(k, n, n_y, m) for each block: changes of y of `of_effect`."""
         linear = [j for j, one in enumerate(effect.parameters) if one.linear]
         if not linear:
-            added = self.model.with_effect(effect)
-            return [(added.answer(part.block, part.body, False).Y - part.response.Y)[None] for part in self.parts]
+            return [part.whole_change(effect)[None] for part in self.parts]
         stepped = []
         for j in linear:
             values = list(effect.values)

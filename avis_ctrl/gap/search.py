@@ -386,7 +386,9 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, run: Run) -> di
 
     made = run.each(begun, chosen)
     most = max((end.gain for _, end in made if end is not None), default=0.0)
-    near = [end.effect for _, end in made if end is not None and end.gain >= settings.not_far_behind * most]
+    # The best is fitted in any case: without path errors its gain is underestimated, and may be negative.
+    least = min(most, settings.not_far_behind * most)
+    near = [end.effect for _, end in made if end is not None and end.gain >= least]
     # If the other parameters must move beyond first order, as with a heavy sprung mass, only a fit of all parameters
     # shows what an effect can achieve.
     near += [

@@ -135,6 +135,65 @@ SMALL = [
 ]
 
 
+WITH_STATES = [
+    ("leveling_loop", "isolators 1-3 z/plain", (0.05,)),
+    ("leveling_loop", "isolators 1-3 z/lag", (0.05, 0.5)),
+    ("mount_relaxation", "isolators z", (0.2, 2.0)),
+    ("mount_surge", "isolators z", (22.0, 0.4, 0.05, 0.0, 0.1, -0.1)),
+    ("attached_oscillator", "payload/xyz", (3.0, 9.0, 0.05, 0.2, -0.1, 0.1)),
+    ("base_compliance", "chassis/z", None),
+    ("payload_flexible_mode", "payload", (24.0, 0.02, *np.linspace(-0.05, 0.06, 12))),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("structural_damping", "isolators/causal"),
+        ("mount_relaxation", "isolators z"),
+        ("leveling_loop", "isolators 1-3 z/plain"),
+        ("attached_oscillator", "payload/z"),
+        ("sensor_gain", "Sz2"),
+    ],
+)
+@pytest.mark.parametrize(("known", "at", "values"), WITH_STATES, ids=[f"{one[0]} {one[1]}" for one in WITH_STATES])
+def test_a_direction_is_the_derivative_of_the_response_to_all_initial_states(known, at, values, name, place):
+    """Beside an effect with internal states, the responses to their initial values and to those of the table may be
+    large and nearly cancel each other. By differences of the whole response."""
+    if name == known:
+        pytest.skip("the model has this effect")
+    rng = np.random.default_rng(8)
+    model = MODEL.with_effect(effect(known, at, values))
+    made = block(model, rng, True)
+    states = model.inner_transients(OMEGA).shape[2]
+    assert states
+    body = np.broadcast_to(rng.standard_normal((12, 1)), (len(OMEGA), 12, 1))
+    made = replace(made, Y=model.answer(made, body, False, rng.standard_normal(states)).Y)
+    part = Score(model, [made]).parts[0]
+    one = effect(name, place, None, model)
+    linear = next(k for k, parameter in enumerate(one.parameters) if parameter.linear)
+    zero, step = list(one.values), 1e-5 * one.parameters[linear].size
+    zero[linear] = one.parameters[linear].none
+    small = one.at([*zero[:linear], zero[linear] + step, *zero[linear + 1 :]])
+
+    def response(strength):
+        """With zero initial values of the added effect's own states, which are the last of their kind."""
+        added = model.with_effect(strength)
+        own = added.inner_transients(OMEGA).shape[2] - states
+        if not own:
+            inner = part.inner
+        elif name == "attached_oscillator":  # impulses and steps, before the first-order states
+            decays = sum(x.shape[2] for x in model.assembled(OMEGA).ops.decays)
+            impulses, steps, rest = np.split(part.inner, [(states - decays) // 2, states - decays])
+            inner = np.concatenate([impulses, [0.0], steps, [0.0], rest])
+        else:  # first-order states
+            inner = np.concatenate([part.inner, np.zeros(own)])
+        return added.answer(made, part.body, False, inner).Y
+
+    expected = (response(small) - response(one.at(zero))) / step
+    np.testing.assert_allclose(part.change(small) / step, expected, atol=1e-4 * np.abs(expected).max())
+
+
 def inner_states(score: Score, one) -> list[np.ndarray]:
     """(m, N) a block: what unit initial states of an effect leave in it, which a refit takes out with the transient."""
     with_it, found = score.model.with_effect(one), []
