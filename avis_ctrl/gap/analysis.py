@@ -32,11 +32,12 @@ from avis_ctrl.gap.search import (
     next_effect_from,
     outliers,
     search,
+    with_undetected,
     without_effect,
 )
 from avis_ctrl.gap.settings import SETTINGS, GapSettings
 from avis_ctrl.gap.signal_effects import levels, named, time_residuals
-from avis_ctrl.gap.table_model import ActiveEffect, TableModel
+from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
 from avis_ctrl.gap.validation import Power, change_from, halves, share_of
 from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood
@@ -175,15 +176,7 @@ def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
 
 def _searched(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """Add the effects that the search finds in addition to those of the best fit."""
-    data, settings = prepared.fit_data, prepared.run.settings
-    ground, before = _excess(fits.base, data), _excess(fits.tolerant, data)
-
-    def enough(step: Step) -> bool:
-        """Whether the effect found last explains a negligible part of the gap."""
-        rise = _left(step.fitted.model.without(step.label), data) - _left(step.fitted.model, data)
-        return rise < settings.trace * ground and rise < settings.minor * before
-
-    steps = search(fits.best, data, _with_unnamed(effects), prepared.run, enough)
+    steps = search(fits.best, prepared.fit_data, _with_unnamed(effects), prepared.run)
     return replace(fits, steps=(*fits.steps, *steps), best=steps[-1].fitted if steps else fits.best)
 
 
@@ -201,15 +194,6 @@ def _without_weak(
     ]
     kept, best = backward_elimination(weak, best, data, settings)
     return tuple(step for step in steps if step in kept or step not in weak), best
-
-
-def _left(model: TableModel, data: Data) -> float:
-    return ModelResidual.of(model, data.blocks).nrmse ** 2
-
-
-def _excess(base: Fitted, data: Data) -> float:
-    residual = ModelResidual.of(base.model, data.blocks)
-    return residual.nrmse**2 - residual.noise_nrmse**2
 
 
 def _names(fits: Fits, prepared: Prepared) -> Names:
@@ -317,12 +301,13 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         Stage(name_of(label)[0], *_figures(after if one is updated else ModelResidual.of(one.model, blocks)))
         for label, one in _chain(fits, updated, prepared)
     ]
+    wider = with_undetected(updated, effects, prepared.fit_data, settings)
     found = [
         NamedEffect(
             one.effect.name,
             name_of(one.label)[1],
             one.effect.titled(one.place),
-            one.effect.reported(updated.model, one.place, one.by_name, updated.covariance_of(one.names)),
+            one.effect.reported(updated.model, one.place, one.by_name, wider.covariance_of(one.names)),
             names.probability[one.label],
             names.rivals[one.label],
             label=one.label,
@@ -381,14 +366,14 @@ def _gap(prepared: Prepared, fits: Fits, names: Names, effects: Sequence[Effect]
         prepared.halves.how,
         seed,
         time.monotonic() - began,
-        updated.whole_covariance(),
+        wider.whole_covariance()[: len(updated.z), : len(updated.z)],
         limits,
         shares,
         records,
         faults.raised if closed else (),
         traces,
         remainder,
-        _moved(updated, settings),
+        _moved(wider, settings),
     )
 
 

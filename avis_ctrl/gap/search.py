@@ -11,7 +11,7 @@ given the effects found later. If a rival replaces one, later effects that no lo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -141,6 +141,21 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
     return fit_or_none(fitted, model, priors, fitted.z[rows], data, settings)
 
 
+def with_undetected(fitted: Fitted, effects: Sequence[Effect], data: Data, settings: GapSettings) -> Fitted:
+    """The fit with the effects of which any table may have too little to be detected (`Effect.always_possible`), at
+    zero strength: as additional parameters, they increase the standard deviations of what their response resembles.
+
+    A structural loss of the mounts, for example, resembles a leveling loop and a relaxation.
+    """
+    for effect in effects:
+        if effect.always_possible and effect.name not in {name_of(label)[0] for label in fitted.labels}:
+            for place in effect.places(fitted.model)[:1]:
+                none = [one.none for one in effect.parameters(fitted.model, place)]
+                one = active(effect, fitted.model, place, none)
+                fitted = with_effect(fitted, one, data, replace(settings, rounds=0, iterations=0)) or fitted
+    return fitted
+
+
 def fit_or_none(
     fitted: Fitted, model: Any, priors: Priors, z: np.ndarray, data: Data, settings: GapSettings
 ) -> Fitted | None:
@@ -151,20 +166,16 @@ def fit_or_none(
         return None
 
 
-def search(
-    base: Fitted, data: Data, effects: Sequence[Effect], run: Run, enough: Callable[[Step], bool] = lambda step: False
-) -> list[Step]:
+def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
     they show in how far one of them had to move, hardly in the residual.
 
-    base : the initial fit, which may already contain effects. enough : whether the search may end after a step because
-        its effect explains next to nothing.
-    The last step has the fit with all effects found.
+    base : the initial fit, which may already contain effects. The last step has the fit with all effects found.
     """
     steps: list[Step] = []
     settings, progress = run.settings, run.progress
 
-    def more(effects: Sequence[Effect], enough: Callable[[Step], bool]) -> None:
+    def more(effects: Sequence[Effect]) -> None:
         while len(base.labels) + len(steps) < settings.longest:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
@@ -175,18 +186,16 @@ def search(
                 steps[-1] = replace(steps[-1], fitted=steps[-1].fitted.bare())
             steps.append(step)
             progress(f"  best model: {', '.join(step.fitted.labels)}")
-            if enough(step):
-                return
 
-    more(effects, enough)
+    more(effects)
     for _ in range(settings.revisions):
         progress("comparison of each effect with its rivals, given the effects found later")
         if not _revised(steps, data, settings):
             break
-        more(effects, enough)
+        more(effects)
     values = of_values(effects, base.model)
     if steps and len(values) < len(effects):  # otherwise they have just been searched
-        more(values, lambda step: False)
+        more(values)
     return steps
 
 

@@ -65,7 +65,6 @@ class GapSettings(FitSettings):
     headline : probability below which a name is only an alternative [1].
     most_sure : largest probability that is reported [1]: the rest allows for explanations that are not in the library.
     trace : fraction of the gap's power below which an effect is a trace [1].
-    minor : fraction of the residual power of the model with tolerances, below which a trace ends the search [1].
     law_p_value, law_change : an effect is refuted if one of its parameters from half of the data (by band, by level)
         differs from the whole with a smaller p-value than this [1] and by more than this fraction of itself [1]; real
         elements follow their textbook law only to a few per cent, which a p-value does not allow for.
@@ -117,7 +116,6 @@ class GapSettings(FitSettings):
     headline: float = 0.5
     most_sure: float = 0.99
     trace: float = 0.01
-    minor: float = 0.1
     law_p_value: float = 1e-4
     law_change: float = 0.2
     least_difference: float = 1e-3

@@ -16,7 +16,7 @@ from scipy.optimize import lsq_linear, minimize
 from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.model_files import model_from_dict, model_to_dict
 from avis_ctrl.gap.probability import odds_against, probabilities, probability_of
-from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effect, without_effect
+from avis_ctrl.gap.search import Step, backward_elimination, is_weak, with_effect, with_undetected, without_effect
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.gap.tolerances import moved, spread, tolerances_behind, within_tolerance
@@ -872,6 +872,28 @@ def test_an_effect_that_those_found_later_replace_is_left_out():
     kept, rest = backward_elimination(steps, now, data, settings)
     assert [step.label for step in kept] == [delay] == list(rest.labels)
     assert rest.model.effects[-1].values[0] == pytest.approx(1e-3, rel=0.02)
+
+
+def test_the_standard_deviation_of_a_leveling_rate_allows_for_a_loss_too_small_to_be_detected():
+    """At 2 Hz, a loss factor of 0.001 acts like a rate lower by 0.002 Hz; the mounts' dampings absorb the rest."""
+    settings, free = replace(GapSettings().quick, rounds=2), default_parameters(RIG)
+    model = TableModel(bare(free))
+    leveled = model.with_effect(active(library()["leveling_loop"], model, "isolators 1-3 z/plain", (0.03,)))
+    truth = leveled.with_effect(active(library()["structural_damping"], model, "isolators/complex", (1e-3,)))
+    data = Data(tuple(block(truth, seed, noise=3e-5) for seed in (5, 6)), (0.2, 0.2))
+    priors = re_identified(RIG, settings)
+    now = fit(model, priors, priors.z(model.values), data, first_variances(data, settings), settings)
+    now = with_effect(now, active(library()["leveling_loop"], model, "isolators 1-3 z/plain"), data, settings)
+    wider = with_undetected(now, list(library().values()), data, settings)
+    (rate,) = now.model.effects[0].names
+    error = now.model.effects[0].values[0] - 0.03
+    plain, allowing = (float(np.sqrt(one.covariance_of([rate])[0, 0])) for one in (now, wider))
+    assert_array_equal(wider.z[:-1], now.z)
+    assert wider.labels[:-1] == now.labels
+    assert error < -3 * plain
+    assert abs(error) < 2 * allowing
+    with_it = with_undetected(wider, list(library().values()), data, settings)
+    assert with_it is wider
 
 
 def test_a_channel_knows_its_mount_wherever_it_is_listed():

@@ -75,6 +75,7 @@ class StructuralDamping(OfMounts):
     title = "besides viscous damping, the mounts have a loss that hardly depends on frequency"
     looks_like = "more damping at low resonances and less at high ones than with dashpots"
     at = ("isolators/causal", "isolators/complex")
+    always_possible = True
     viscous = " viscous"  # suffix of a place: its law in a rig file
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
