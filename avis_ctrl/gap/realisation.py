@@ -181,8 +181,9 @@ def _drives(model: TableModel) -> list[StateSpace]:
             factors[one.place] *= one.by_name["gain"]
         if one.effect.name == "actuator_lag" and len(one.values) > 1:
             tau = max(model.base.amplifier_time_constant_s + one.by_name["time_constant_s"], 1e-9)
-            each = np.maximum(lags(model.base, one.by_name), 1e-9)
-            added = [cascade([-1 / tau], [-1 / own], tau / own) for own in each]
+            poles = np.maximum(lags(model.base, one.by_name), 1e-9)
+            each = np.broadcast_to(poles, (len(poles), len(model.actuators))).T
+            added = [cascade([-1 / tau], list(-1 / own), tau / float(np.prod(own))) for own in each]
     return [lag.scaled(factors[name]) for lag, name in zip(added, model.actuators, strict=True)]
 
 

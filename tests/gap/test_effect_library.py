@@ -289,6 +289,15 @@ def test_derivative_by_the_time_constant_of_amplifiers_with_an_added_lag(rng, de
     np.testing.assert_allclose(found[2], slope, atol=1e-5 * np.abs(slope).max())  # the two time constants add up
 
 
+def test_an_amplifier_of_two_poles_has_the_delay_of_its_time_constant():
+    f = np.array([3.0, 12.0])
+    slow = with_effect("actuator_lag", "actuators/two", [2e-3, 0.7])
+    ratio = (slow.response(2 * np.pi * f) / BARE.response(2 * np.pi * f))[:, 1, 1]
+    s = 2j * np.pi * f
+    np.testing.assert_allclose(ratio, 1 / ((1 + 1.4e-3 * s) * (1 + 0.6e-3 * s)), rtol=2e-3)
+    assert -np.angle(ratio[0]) / (2 * np.pi * f[0]) == pytest.approx(2e-3, rel=2e-3)
+
+
 def test_a_lag_is_a_value_with_a_tolerance_only_if_the_model_has_one():
     known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=300.0))
     effects, stated = list(library().values()), tolerances_of(RIG)
@@ -477,6 +486,8 @@ def values_at(name, place):
         values = [20.0, -15.0, 10.0, *values[3:]]
     if name == "attached_oscillator" and place.endswith(("axes", "turned")):
         values = [10.0, 12.0, 9.0, 15.0, *values[4:], 0.2, -0.1, 0.3]
+    if place == "actuators/two":
+        values = [2e-3, 0.7]
     if name == "cubic_stiffness" and place.endswith("polynomial"):
         values = [values[0], 1e8, 1e22, *values[1:]]
     return values[: len(parameters)]

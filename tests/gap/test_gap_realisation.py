@@ -37,6 +37,7 @@ LINEAR = [
     ("actuator_gain", "Az1", (1.3,)),
     ("actuator_lag", "actuators", (TAU,)),
     ("actuator_lag", "actuators/each", (TAU, 0.1, -0.2, 0.05, 0.12, -0.1, 0.15, -0.07)),
+    ("actuator_lag", "actuators/two", (TAU, 0.7)),
     ("loop_delay", "loop", (2e-3,)),
     ("com_offset", "payload", (0.02, 0.01, -0.03)),
     ("product_of_inertia", "Jxy", (5.0,)),

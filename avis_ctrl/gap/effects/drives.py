@@ -30,29 +30,43 @@ class ActuatorGain(Effect):
 
 @register
 class ActuatorLag(Effect):
-    """First-order lag 1/(1 + s tau) of every amplifier, corner 1/(2 pi tau): one tau for all, or different ones about
-    their mean. If the model already has a lag, tau is the difference from its time constant.
+    """Lag 1/(1 + s tau) of every amplifier, corner 1/(2 pi tau). If the model already has a lag, tau is the difference
+    from its time constant.
 
-    Aliased components pass the mean corner. With corners that differ by a factor of two, the error is 0.1 % of the
-    response at a tenth of the sample rate, and 1 % at a fifth.
+    each : different tau about their mean. two : two poles, 1/((1 + s a tau) (1 + s (1 - a) tau)), with the same delay
+    tau at low frequency.
+
+    Aliased components pass the mean corner, of one pole. With corners that differ by a factor of two, the error is
+    0.1 % of the response at a tenth of the sample rate, and 1 % at a fifth.
     """
 
     name = "actuator_lag"
     title = "a first-order lag of the current amplifiers"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
-    at = ("actuators", "actuators/each")
+    at = ("actuators", "actuators/each", "actuators/two")
+
+    def titled(self, place: str) -> str:
+        return "a lag of the current amplifiers with two poles" if place.endswith("/two") else self.title
 
     def parameters(self, model: Table, place: str) -> tuple[EffectParameter, ...]:
-        own = uneven(model.actuators[:-1], "relative deviation of drive {} from the mean") if "/" in place else ()
+        law = place.partition("/")[2]
+        own: tuple[EffectParameter, ...] = ()
+        if law == "each":
+            own = uneven(model.actuators[:-1], "relative deviation of drive {} from the mean")
+        if law == "two":
+            words = "fraction of the time constant in the slower pole"
+            own = (EffectParameter.shape("slower_share", "1", words, 0.5, 0.999, 0.2, (0.75,), optional=True),)
         known = (model.nominal or model.base).amplifier_time_constant_s
         words = "time constant of the amplifiers" + (f" beyond the expected {1e3 * known:.3g} ms" if known else "")
         return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
 
     def change(self, ops: Operators, place: str, values: Values) -> None:
-        tau, each = values["time_constant_s"] + ops.base.amplifier_time_constant_s, lags(ops.base, values)
+        tau, s = values["time_constant_s"] + ops.base.amplifier_time_constant_s, ops.s[:, None]
         ops.amplifier_corner_Hz = 1 / (2 * np.pi * tau) if tau > 1e-9 else None
-        if len(each) > 1:
-            ops.drive = ops.drive * (1 + ops.s[:, None] * tau) / (1 + ops.s[:, None] * each)
+        if len(values) > 1:
+            ops.drive = ops.drive * (1 + s * tau)
+            for each in lags(ops.base, values):
+                ops.drive = ops.drive / (1 + s * each)
 
     def reported(self, model: Table, place: str, values: Values, covariance: np.ndarray) -> dict[str, Reported]:
         found = super().reported(model, place, values, covariance)
@@ -65,8 +79,11 @@ class ActuatorLag(Effect):
 
 
 def lags(model: ResponseModel, values: Values) -> np.ndarray:
-    """(n_u,) time constants of the amplifiers with the effect [s], not below zero; (1,) if all are equal."""
-    return np.maximum(model.amplifier_time_constant_s + values["time_constant_s"] * shares(values), 0.0)
+    """(poles, n_u) time constants of the amplifiers with the effect [s], not below zero; (poles, 1) if equal."""
+    slower = values.get("slower_share", 1.0)
+    poles = np.array([slower, 1 - slower] if "slower_share" in values else [1.0])
+    each = model.amplifier_time_constant_s + values["time_constant_s"] * shares(values)
+    return np.maximum(poles[:, None] * each, 0.0)
 
 
 @register
