@@ -243,55 +243,90 @@ def _spread(one: RecordResidual, f: float) -> np.ndarray:
     return 2 * np.mean(np.abs(one.E[near]) ** 2, axis=0) / one.header.samples
 
 
+@dataclass(frozen=True, eq=False)
+class _Demodulated:
+    """A line of a record, shifted to zero frequency: harmonic, times t (n,) [s], complex values (n,) averaged over some
+    samples, variance of the cosine or sine amplitude, and duration [s]."""
+
+    harmonic: int
+    t: np.ndarray
+    values: np.ndarray
+    variance: float
+    duration_s: float
+
+    def mean(self, shift_Hz: float) -> float:
+        """Magnitude of the mean, a quarter of the amplitude, if the fundamental is higher by `shift_Hz`."""
+        return float(abs(np.mean(self.values * np.exp(-2j * np.pi * self.harmonic * shift_Hz * self.t))))
+
+    def information(self, shift_Hz: float) -> float:
+        """Inverse variance of the fundamental [1/Hz^2]: of a sine in white noise, var(2 pi f) = 12 v/(A T)^2 with v the
+        variance of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window."""
+        A2 = (4 * self.mean(shift_Hz)) ** 2
+        size = max(A2 - 2 * self.variance, 0.0) / self.variance
+        return (2 * np.pi * self.harmonic * self.duration_s) ** 2 * size / 12 / HANN_COST
+
+
+def _demodulated(one: RecordResidual, f0: float, hits: np.ndarray) -> list[_Demodulated]:
+    """Significant lines of a record; about 64 values each make the fine search cheap."""
+    n, rate = one.header.samples, one.header.sample_rate_Hz
+    window, block, found = hann(n, sym=False), max(n // 64, 1), []
+    for k, j in hits:
+        turned = one.e[:, j] * window * np.exp(-2j * np.pi * (k + 1) * f0 / rate * np.arange(n))
+        coarse = turned[: n // block * block].reshape(-1, block).mean(axis=1)
+        t = (np.arange(len(coarse)) * block + (block - 1) / 2) / rate
+        found.append(_Demodulated(int(k) + 1, t, coarse, float(_spread(one, (k + 1) * f0)[j]), n / rate))
+    return found
+
+
 def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
     """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
-    Its variance is that of a sine in white noise of the local level, var(2 pi f) = 12 v / (A T)^2 with v the variance
-    of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window, for all lines together.
+    Its variance is that of sines in noise (`_Demodulated.information`) or that from the scatter between the records,
+    whichever is larger: the frequency of the mains wanders by some mHz.
     """
-    rate = residuals[0].header.sample_rate_Hz
-    pieces = []
-    for one in residuals:
-        n = one.header.samples
-        window = hann(n, sym=False)
-        for k, j in hits:
-            k = int(k) + 1
-            # Shifted to zero frequency and averaged down to about 60 values, which makes the fine search cheap.
-            block = max(n // 64, 1)
-            turned = one.e[:, j] * window * np.exp(-2j * np.pi * k * start / rate * np.arange(n))
-            coarse = turned[: n // block * block].reshape(-1, block).mean(axis=1)
-            t = (np.arange(len(coarse)) * block + (block - 1) / 2) / rate
-            pieces.append((k, t, coarse, float(_spread(one, k * start)[j]), n / rate))
-
-    def power(shift: float) -> float:
-        return -sum(abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t))) ** 2 / s for k, t, c, s, _ in pieces)
-
+    records = [_demodulated(one, start, hits) for one in residuals]
     reach = 1.0 / max(one.header.duration_s for one in residuals)
-    shift = float(
-        optimize.minimize_scalar(power, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-5 * reach}).x
-    )
-    information = 0.0
-    for k, t, c, s, duration in pieces:
-        # The window's mean is 1/2; s is the variance of the cosine or sine amplitude.
-        A2 = (4 * abs(np.mean(c * np.exp(-2j * np.pi * k * shift * t)))) ** 2
-        information += (2 * np.pi * k * duration) ** 2 * max(A2 - 2 * s, 0.0) / s / 12 / HANN_COST
-    return Reported(start + shift, float(1 / np.sqrt(max(information, 1e-30))), "Hz")
+
+    def best(lines: Sequence[_Demodulated]) -> float:
+        found = optimize.minimize_scalar(
+            lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines),
+            bounds=(-reach, reach),
+            method="bounded",
+            options={"xatol": 1e-5 * reach},
+        )
+        return float(found.x)
+
+    shift = best([one for lines in records for one in lines])
+    each = np.array([best(lines) for lines in records])
+    weights = np.array([float(sum(one.information(shift) for one in lines)) for lines in records])
+    return Reported(start + shift, _std_of_mean(each - shift, weights), "Hz")
+
+
+def _std_of_mean(difference: np.ndarray, weights: np.ndarray) -> float:
+    """Standard deviation of a mean with weights that are inverse variances (n,), from these or, if larger, from the
+    scatter of the values about the mean, difference (n,)."""
+    total, n = max(float(weights.sum()), 1e-30), int(np.count_nonzero(weights))
+    scatter = float(np.sum((weights * difference) ** 2)) / total**2 * n / (n - 1) if n > 1 else 0.0
+    return float(np.sqrt(max(1 / total, scatter)))
 
 
 def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
     names, unit, rate = residuals[0].header.y_names, residuals[0].header.y_unit, residuals[0].header.sample_rate_Hz
     found = []
     ks = sorted({int(k) + 1 for k, _ in hits})
-    power, weight = np.zeros((len(ks), len(names))), np.zeros((len(ks), len(names)))
-    for one in residuals:
+    sizes, weights = np.zeros((2, len(residuals), len(ks), len(names)))
+    for r, one in enumerate(residuals):
         A = _sines(f0, ks, one.header.samples, rate)
         c = _fitted(A, one.e)
         v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
         # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; only its radial component changes the amplitude.
-        power += (c[: len(ks)] ** 2 + c[len(ks) :] ** 2 - 2 * v) / v
-        weight += 1 / v
+        sizes[r] = c[: len(ks)] ** 2 + c[len(ks) :] ** 2 - 2 * v
+        weights[r] = 1 / v
+    power = np.sum(weights * sizes, axis=0) / np.sum(weights, axis=0)
     for k, j in hits:
         i = ks.index(int(k) + 1)
-        size = Reported(float(np.sqrt(max(power[i, j] / weight[i, j], 0.0))), float(1 / np.sqrt(weight[i, j])), unit)
+        amplitude = float(np.sqrt(max(power[i, j], 0.0)))
+        difference = np.sqrt(np.maximum(sizes[:, i, j], 0.0)) - amplitude
+        size = Reported(amplitude, _std_of_mean(difference, weights[:, i, j]), unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
