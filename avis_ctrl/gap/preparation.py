@@ -18,7 +18,8 @@ from avis_ctrl.gap.campaign_spectra import Halves, all_silent, blocks_of, divide
 from avis_ctrl.gap.effects.large_motion import LargeMotion
 from avis_ctrl.gap.line_response import clear_cache
 from avis_ctrl.gap.motion_estimate import motion_of, origin, with_large_motion
-from avis_ctrl.gap.run import Run
+from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.run import Mapper, Run
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.signal_effects import SignalFaults, converter_faults, predicted, time_residuals, without_hum
 from avis_ctrl.gap.signals.declipping import repair
@@ -141,6 +142,22 @@ def with_noise_from(prepared: Prepared, model: TableModel) -> Prepared:
     return replace(prepared, fitted=tuple(fitted), held_out=tuple(held_out), unmasked=tuple(unmasked), noise=how)
 
 
+def with_motion_of(prepared: Prepared, model: TableModel) -> Prepared:
+    """Estimate the motion of every record again, with a better model."""
+    motion = _motion(prepared.campaign, prepared.halves, model, prepared.run.each)
+    return replace(
+        prepared, nominal=replace(prepared.nominal, motion=motion), rough=replace(prepared.rough, motion=motion)
+    )
+
+
+def _motion(campaign: Campaign, halves: Halves, model: TableModel, each: Mapper) -> dict[str, RecordMotion]:
+    """Motion of every fitted and held-out record, by record name, with its second-order terms."""
+    parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
+    motion = with_large_motion(motion_of(parts, model, campaign, each), model)
+    clear_cache()
+    return motion
+
+
 def check_band(campaign: Campaign, band: tuple[float, float], settings: GapSettings) -> None:
     """Raise InputError for a band in which the records are not excited, or have too few lines."""
     low, high = excited_band(campaign)
@@ -183,9 +200,7 @@ def _ready(
     held_out = _masked(blocks_of(halves.held_out, rough, band), halves.held_out, hum)
     progress("noise; motion of the table in every record")
     (fitted, held_out, unmasked), how = _noise((fitted, held_out, raw_held), halves, residual, rough, band)
-    parts = replace(halves.fitted, records=(*halves.fitted.records, *halves.held_out.records))
-    motion = with_large_motion(motion_of(parts, rough, campaign, each), rough)
-    clear_cache()
+    motion = _motion(campaign, halves, rough, each)
     return Prepared(
         campaign,
         halves,

@@ -175,8 +175,8 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
     steps: list[Step] = []
     settings, progress = run.settings, run.progress
 
-    def more(effects: Sequence[Effect]) -> None:
-        while len(base.labels) + len(steps) < settings.longest:
+    def more(effects: Sequence[Effect], most: int) -> None:
+        while len(base.labels) + len(steps) < most:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(base.labels) + len(steps) + 1}")
             step = next_effect(now, data, effects, run)
@@ -187,15 +187,15 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
             steps.append(step)
             progress(f"  best model: {', '.join(step.fitted.labels)}")
 
-    more(effects)
+    more(effects, settings.longest)
     for _ in range(settings.revisions):
         progress("comparison of each effect with its rivals, given the effects found later")
         if not _revised(steps, data, settings):
             break
-        more(effects)
+        more(effects, settings.longest)
     values = of_values(effects, base.model)
     if steps and len(values) < len(effects):  # otherwise they have just been searched
-        more(values)
+        more(values, len(base.labels) + len(steps) + settings.longest)
     return steps
 
 

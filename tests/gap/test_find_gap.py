@@ -48,6 +48,25 @@ def test_nothing_is_missing(seed):
     assert found.gap.where == ()
 
 
+# Campaigns of the blind table of version 0.4.0 in which an earlier engine was wrong: seed, whether the table is off its
+# rig file everywhere, effect, its parameter in report and truth, and the largest relative error.
+ONCE_WRONG = [
+    (93281, False, "attached_oscillator", "mass_kg", "mass_kg", 0.03),  # three close frequencies
+    (93183, True, "leveling_loop", "rate_Hz", "rate_Hz", 0.06),  # beside a small structural loss
+    (93172, True, "actuator_lag", "corner_Hz", "corner_Hz", 0.01),  # amplifiers of second order
+    (93236, True, "cubic_stiffness", "k3_N_per_m3", "cubic_N_per_m3", 0.05),  # a sensor's gain is wrong, too
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "clutter", "name", "reported", "hidden", "most"), ONCE_WRONG)
+def test_parameters_that_were_once_wrong(seed, clutter, name, reported, hidden, most):
+    drawn, found = found_in(60.0, seed=seed, clutter=clutter)
+    (true,) = (one.parameters[hidden] for one in drawn.effects if one.name == name)
+    (mine,) = (one for one in (*found.gap.effects, *found.gap.traces) if one.name == name)
+    assert mine.parameters[reported].value == pytest.approx(true, rel=most)
+
+
 # One of each family: seed, strength (gross where a small departure is within tolerance), duration, and the truth's
 # name of the parameter by the report's.
 ONE = {
@@ -109,8 +128,11 @@ def test_a_gain_that_drifts_is_named_beside_a_lag():
 def test_a_gain_is_named_beside_a_flexible_mode():
     """The force of this drive also acts on the mode."""
     case, found = found_in(seed=81027, clutter=True, duration_s=60.0)
-    assert {one.name for one in case.effects} == {"actuator_gain", "payload_flexible_mode"}
-    assert {one.name: one.location for one in found.gap.effects} == {one.name: one.location for one in case.effects}
+    true = {one.name: one.location for one in case.effects}
+    assert set(true) == {"actuator_gain", "payload_flexible_mode"}
+    named = {one.name: one.location for one in found.gap.effects}
+    assert true.items() <= named.items()
+    assert named.keys() - true.keys() <= {one.name for one in case.traces}  # of every table of this kind
 
 
 @pytest.mark.slow
