@@ -113,7 +113,7 @@ def analyse(
         prepared = with_noise_from(prepared, fits.best.model)
         fits = _refitted(fits, prepared, known)
     if any(fits.best.model.effect(label).effect.nonlinear for label in fits.best.labels):
-        progress("motion of the table in every record, with the model that was found")
+        progress("motion of the table estimated again, with the effects that were found")
         prepared = with_motion_of(prepared, fits.best.model)
         fits = _with_motion(fits, prepared)
     steps, best = _without_weak(fits.steps, fits.best, prepared.fit_data, settings)

@@ -98,8 +98,8 @@ def symmetric_coordinates(S: np.ndarray) -> np.ndarray:
 class Part:
     """One block at the model: its response with the initial values of its transient.
 
-    body : (n, 12, 1) impulses and steps of the transient in the data. inner : (m,) initial internal states. An effect
-    changes the response to both, which may be large and nearly cancel each other.
+    body : (n, 12, 1) impulses and steps of the transient in the data. inner : (m,) initial internal states. The
+    responses to both may be large and nearly cancel; an effect changes each of them.
     """
 
     def __init__(self, model: TableModel, block: SpectralBlock, body: np.ndarray | None, inner: np.ndarray | None):

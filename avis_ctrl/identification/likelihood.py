@@ -257,8 +257,8 @@ def _log_volume(at: _Expansion, priors: Priors) -> float:
 
     A normal distribution with the curvature of the expansion, at a bound also with its gradient, is integrated between
     the bounds of each parameter; the others follow to first order, and different parameters are taken as independent.
-    A gradient that points away from the bound is ignored: the fit ended early, and the maximum that the expansion
-    predicts inside has not been reached.
+    If the sum of squares still falls from the bound inwards, the fit ended early; this slope is ignored, because the
+    maximum that it predicts was not reached.
     """
     H, (low, high) = at.H + np.eye(len(at.z)), priors.bounds
     bounded = np.isfinite(low) | np.isfinite(high)

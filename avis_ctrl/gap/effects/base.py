@@ -211,7 +211,7 @@ class Effect(ABC):
     holds_states : has states of its own; their values at the ends of a record are estimated with its transient.
     resonant : adds resonances with many parameters, which a mode of any shape describes approximately.
     outside : an effect of `effects.outside_library`, fitted in competition with the library and never named.
-    always_possible : any table may have too little of it to be detected; standard deviations allow for that.
+    always_possible : any table may have it, too weak to be detected; the standard deviations of others allow for it.
     """
 
     name: str

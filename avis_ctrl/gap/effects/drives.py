@@ -36,14 +36,20 @@ class ActuatorLag(Effect):
     each : different tau about their mean. two : two poles, 1/((1 + s a tau) (1 + s (1 - a) tau)), with the same delay
     tau at low frequency.
 
-    Aliased components pass the mean corner, of one pole. With corners that differ by a factor of two, the error is
-    0.1 % of the response at a tenth of the sample rate, and 1 % at a fifth.
+    For aliased components, every law is approximated by one pole at the mean corner. With corners that differ by a
+    factor of two, the error is 0.1 % of the response at a tenth of the sample rate, and 1 % at a fifth; with two poles
+    0.4 % and 2 %.
     """
 
     name = "actuator_lag"
     title = "a first-order lag of the current amplifiers"
     looks_like = "phase lag that grows with frequency, the same in every channel, with a loss of gain"
     at = ("actuators", "actuators/each", "actuators/two")
+
+    def places(self, model: Table) -> tuple[str, ...]:
+        # Beside an expected lag, two poles with the expected total would be another table.
+        known = (model.nominal or model.base).amplifier_time_constant_s
+        return self.at[:2] if known else self.at
 
     def titled(self, place: str) -> str:
         return "a lag of the current amplifiers with two poles" if place.endswith("/two") else self.title

@@ -261,6 +261,8 @@ class _Demodulated:
     def information(self, shift_Hz: float) -> float:
         """Inverse variance of the fundamental [1/Hz^2]: of a sine in white noise, var(2 pi f) = 12 v/(A T)^2 with v the
         variance of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window."""
+        if not self.variance:  # a channel that is constant in this record
+            return 0.0
         A2 = (4 * self.mean(shift_Hz)) ** 2
         size = max(A2 - 2 * self.variance, 0.0) / self.variance
         return (2 * np.pi * self.harmonic * self.duration_s) ** 2 * size / 12 / HANN_COST
@@ -282,14 +284,15 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
     """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
     Its variance is that of sines in noise (`_Demodulated.information`) or that from the scatter between the records,
-    whichever is larger: the frequency of the mains wanders by some mHz.
+    whichever is larger, because the frequency of the mains varies by some mHz. With few records, or one that is much
+    longer than the others, the scatter is not known well.
     """
     records = [_demodulated(one, start, hits) for one in residuals]
     reach = 1.0 / max(one.header.duration_s for one in residuals)
 
     def best(lines: Sequence[_Demodulated]) -> float:
         found = optimize.minimize_scalar(
-            lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines),
+            lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines if one.variance),
             bounds=(-reach, reach),
             method="bounded",
             options={"xatol": 1e-5 * reach},
@@ -304,9 +307,11 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
 
 def _std_of_mean(difference: np.ndarray, weights: np.ndarray) -> float:
     """Standard deviation of a mean with weights that are inverse variances (n,), from these or, if larger, from the
-    scatter of the values about the mean, difference (n,)."""
-    total, n = max(float(weights.sum()), 1e-30), int(np.count_nonzero(weights))
-    scatter = float(np.sum((weights * difference) ** 2)) / total**2 * n / (n - 1) if n > 1 else 0.0
+    scatter of the values about the mean, difference (n,). With one value, there is no scatter."""
+    total = max(float(weights.sum()), 1e-30)
+    share = weights / total
+    known = 1 - float(share @ share)  # of the scatter, after the mean was fitted to the values
+    scatter = float(np.sum((share * difference) ** 2)) / known if known > 1e-9 else 0.0
     return float(np.sqrt(max(1 / total, scatter)))
 
 
@@ -318,11 +323,11 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
     for r, one in enumerate(residuals):
         A = _sines(f0, ks, one.header.samples, rate)
         c = _fitted(A, one.e)
-        v = np.maximum(np.array([_spread(one, k * f0) for k in ks]), 1e-300)
+        v = np.array([_spread(one, k * f0) for k in ks])
         # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; only its radial component changes the amplitude.
         sizes[r] = c[: len(ks)] ** 2 + c[len(ks) :] ** 2 - 2 * v
-        weights[r] = 1 / v
-    power = np.sum(weights * sizes, axis=0) / np.sum(weights, axis=0)
+        weights[r] = np.divide(1.0, v, out=np.zeros_like(v), where=v > 0)  # a constant channel shows no hum
+    power = np.sum(weights * sizes, axis=0) / np.maximum(np.sum(weights, axis=0), 1e-300)
     for k, j in hits:
         i = ks.index(int(k) + 1)
         amplitude = float(np.sqrt(max(power[i, j], 0.0)))
