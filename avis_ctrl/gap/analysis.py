@@ -33,6 +33,7 @@ from avis_ctrl.gap.search import (
     next_effect_from,
     outliers,
     search,
+    with_motion,
     with_undetected,
     without_effect,
 )
@@ -41,7 +42,7 @@ from avis_ctrl.gap.signal_effects import levels, named, time_residuals
 from avis_ctrl.gap.table_model import ActiveEffect
 from avis_ctrl.gap.tolerances import credible, has_tolerance, moved, of_effect, tolerances_behind, with_tolerance
 from avis_ctrl.gap.validation import Power, change_from, halves, share_of
-from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood
+from avis_ctrl.identification.likelihood import Data, Fitted, first_variances, fit, log_likelihood, refit
 from avis_ctrl.identification.priors import Tolerance, re_identified, tolerances_of, with_tolerances
 from avis_ctrl.measurement.campaign import Campaign
 from avis_ctrl.rigs.rig import Rig
@@ -169,24 +170,20 @@ def _searched_from(at_file: Fitted, fits: Fits, prepared: Prepared, effects: Seq
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """Refit the last model with the new noise estimate and continue the search from there. Effects found before are
     still judged with the noise estimate with which they were found."""
-    best = fits.best
-    best = fit(best.model, best.priors, best.z, prepared.fit_data, best.variances, prepared.run.settings)
+    best = refit(fits.best, prepared.fit_data, prepared.run.settings)
     return _searched(replace(fits, best=best), prepared, effects)
 
 
 def _with_motion(fits: Fits, prepared: Prepared) -> Fits:
-    """The fits with another motion of the records; the last model is fitted again.
+    """The fits with the motion of the records as prepared; the last model is fitted again.
 
     The first motion is that of a model with the sensors as in the rig file. The force of a cubic spring changes by 3 %
     with 1 % of its deflection.
     """
-    motion = prepared.nominal.motion
 
     def moved(one: Fitted) -> Fitted:
-        return replace(one, model=replace(one.model, motion=motion))
+        return with_motion(one, prepared.nominal.motion)
 
-    best = moved(fits.best)
-    best = fit(best.model, best.priors, best.z, prepared.fit_data, best.variances, prepared.run.settings)
     steps = (
         replace(
             step,
@@ -196,6 +193,7 @@ def _with_motion(fits: Fits, prepared: Prepared) -> Fits:
         )
         for step in fits.steps
     )
+    best = refit(moved(fits.best), prepared.fit_data, prepared.run.settings)
     return Fits(moved(fits.base), moved(fits.tolerant), tuple(steps), best)
 
 

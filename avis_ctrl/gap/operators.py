@@ -327,8 +327,8 @@ class Assembled:
         return np.split(inner, np.cumsum(self._state_counts)[:-1])
 
     def states_of(self, fewer: Assembled, inner: np.ndarray) -> np.ndarray:
-        """(m,) initial states (`forces_of_states`) of a table without the effect that was added last, in the order of
-        this one; zero for the states of that effect."""
+        """(m,) initial states (`forces_of_states`) of the table before its last effect was added, in the order of this
+        table; those of that effect are zero."""
         return np.concatenate(
             [
                 np.pad(own, (0, count - len(own)))

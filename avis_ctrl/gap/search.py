@@ -21,13 +21,14 @@ from avis_ctrl.errors import AvisError
 from avis_ctrl.gap.effects.base import Effect, shares
 from avis_ctrl.gap.effects.flexible_mode import resonance
 from avis_ctrl.gap.probability import Step, name_of, prior_odds, probability_of
+from avis_ctrl.gap.record_motion import RecordMotion
 from avis_ctrl.gap.run import Run
 from avis_ctrl.gap.score import EvidenceScore
 from avis_ctrl.gap.settings import GapSettings
 from avis_ctrl.gap.starting_values import HasExtendedModels, seeds
 from avis_ctrl.gap.table_model import ActiveEffect, TableModel, active
 from avis_ctrl.gap.tolerances import of_effect, of_values, rescaled, spread, tolerances_behind, within_tolerance
-from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, without_path_errors
+from avis_ctrl.identification.likelihood import Data, Fitted, Profile, fit, refit, without_path_errors
 from avis_ctrl.identification.priors import Priors, tolerances_of
 
 
@@ -142,10 +143,10 @@ def without_effect(fitted: Fitted, label: str, data: Data, settings: GapSettings
 
 
 def with_undetected(fitted: Fitted, effects: Sequence[Effect], data: Data, settings: GapSettings) -> Fitted:
-    """The fit with the effects of which any table may have too little to be detected (`Effect.always_possible`), at
-    zero strength: as additional parameters, they increase the standard deviations of what their response resembles.
+    """The fit with each effect that a table may have unnoticed (`Effect.always_possible`) added at zero strength.
 
-    A structural loss of the mounts, for example, resembles a leveling loop and a relaxation.
+    Nothing is fitted again; the standard deviations of effects with a similar response become larger. A structural loss
+    of the mounts, for example, resembles a leveling loop and a relaxation.
     """
     for effect in effects:
         if effect.always_possible and effect.name not in {name_of(label)[0] for label in fitted.labels}:
@@ -238,7 +239,7 @@ def _revised(steps: list[Step], data: Data, settings: GapSettings) -> bool:
             steps[k] = again
             continue
         one = again.tried[label]
-        full = fit(one.model, one.priors, one.z, data, one.variances, settings)
+        full = refit(one, data, settings)
         steps[k] = replace(again, fitted=full.bare(), label=label)
         steps[k + 1 :], best = backward_elimination(steps[k + 1 :], full, data, settings)
         steps[-1] = replace(steps[-1], fitted=best)
@@ -315,11 +316,7 @@ def _with_best(now: Fitted, tried: dict[str, Fitted], count: int, data: Data, se
     """The step with the effect of the largest evidence. The candidates near the best are fitted to the end."""
     best = _likeliest(tried, settings)
     least = tried[best].log_evidence - settings.near_tie
-    ended = {
-        label: fit(one.model, one.priors, one.z, data, one.variances, settings)
-        for label, one in tried.items()
-        if one.log_evidence >= least
-    }
+    ended = {label: refit(one, data, settings) for label, one in tried.items() if one.log_evidence >= least}
     best = _likeliest(ended, settings)
     return Step(now.bare(), ended[best], tried | {label: one.bare() for label, one in ended.items()}, count)
 
@@ -419,7 +416,7 @@ def _joint_fits(now: Fitted, effects: Sequence[ActiveEffect], data: Data, run: R
     def ended(one: ActiveEffect) -> Fitted | None:
         return _small(with_effect(now, one, data, run.settings.quick))
 
-    found = [_whole(one, now) for one in run.each(ended, effects) if one is not None]
+    found = [with_motion(one, now.model.motion) for one in run.each(ended, effects) if one is not None]
     stated = tolerances_of(now.model.rig)
     return [
         one
@@ -451,11 +448,12 @@ def at_full_strength(one: ActiveEffect) -> bool:
 
 def _small(found: Fitted | None) -> Fitted | None:
     """The fit without its large data, mainly the motion of the records, for the transfer from another process."""
-    return found and replace(found.bare(), model=replace(found.model, motion={}))
+    return found and with_motion(found.bare(), {})
 
 
-def _whole(found: Fitted, like: Fitted) -> Fitted:
-    return replace(found, model=replace(found.model, motion=like.model.motion))
+def with_motion(fitted: Fitted, motion: Mapping[str, RecordMotion]) -> Fitted:
+    """The fit with another motion of the records, not fitted again."""
+    return replace(fitted, model=replace(fitted.model, motion=motion))
 
 
 def implausible(fitted: Fitted) -> str:

@@ -360,6 +360,11 @@ def fit(
     )
 
 
+def refit(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
+    """The same model fitted again, from where it is: to other data, with other settings, or after a change of it."""
+    return fit(fitted.model, fitted.priors, fitted.z, data, fitted.variances, settings)
+
+
 def without_path_errors(fitted: Fitted, data: Data, settings: FitSettings = SETTINGS) -> Fitted:
     """The fit with minimum path errors, so that distortion represents everything that is not explained.
 

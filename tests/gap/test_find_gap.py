@@ -53,7 +53,7 @@ def test_nothing_is_missing(seed):
 ONCE_WRONG = [
     (93281, False, "attached_oscillator", "mass_kg", "mass_kg", 0.03),  # three close frequencies
     (93183, True, "leveling_loop", "rate_Hz", "rate_Hz", 0.06),  # beside a small structural loss
-    (93172, True, "actuator_lag", "corner_Hz", "corner_Hz", 0.01),  # amplifiers of second order
+    (93172, True, "actuator_lag", "corner_Hz", "corner_Hz", 0.01),  # amplifiers with two poles
     (93236, True, "cubic_stiffness", "k3_N_per_m3", "cubic_N_per_m3", 0.05),  # a sensor's gain is wrong, too
 ]
 

@@ -47,9 +47,8 @@ class ActuatorLag(Effect):
     at = ("actuators", "actuators/each", "actuators/two")
 
     def places(self, model: Table) -> tuple[str, ...]:
-        # Beside an expected lag, two poles with the expected total would be another table.
-        known = (model.nominal or model.base).amplifier_time_constant_s
-        return self.at[:2] if known else self.at
+        # Two poles with the time constant that is expected would not be the expected table.
+        return tuple(place for place in self.at if not (place.endswith("/two") and expected_lag(model)))
 
     def titled(self, place: str) -> str:
         return "a lag of the current amplifiers with two poles" if place.endswith("/two") else self.title
@@ -62,7 +61,7 @@ class ActuatorLag(Effect):
         if law == "two":
             words = "fraction of the time constant in the slower pole"
             own = (EffectParameter.shape("slower_share", "1", words, 0.5, 0.999, 0.2, (0.75,), optional=True),)
-        known = (model.nominal or model.base).amplifier_time_constant_s
+        known = expected_lag(model)
         words = "time constant of the amplifiers" + (f" beyond the expected {1e3 * known:.3g} ms" if known else "")
         return (EffectParameter("time_constant_s", "s", words, 0.0, -known, 0.3, 1e-3), *own)
 
@@ -84,12 +83,17 @@ class ActuatorLag(Effect):
         return {"corner_Hz": Reported(1 / (2 * np.pi * tau), std / (2 * np.pi * tau**2), "Hz"), **found}
 
 
+def expected_lag(model: Table) -> float:
+    """Time constant of the amplifiers that a table is expected to have [s]; zero without an expected lag."""
+    return (model.nominal or model.base).amplifier_time_constant_s
+
+
 def lags(model: ResponseModel, values: Values) -> np.ndarray:
     """(poles, n_u) time constants of the amplifiers with the effect [s], not below zero; (poles, 1) if equal."""
-    slower = values.get("slower_share", 1.0)
-    poles = np.array([slower, 1 - slower] if "slower_share" in values else [1.0])
+    slower = values.get("slower_share")
+    poles = [1.0] if slower is None else [slower, 1 - slower]
     each = model.amplifier_time_constant_s + values["time_constant_s"] * shares(values)
-    return np.maximum(poles[:, None] * each, 0.0)
+    return np.maximum(np.outer(poles, each), 0.0)
 
 
 @register

@@ -261,22 +261,24 @@ class _Demodulated:
     def information(self, shift_Hz: float) -> float:
         """Inverse variance of the fundamental [1/Hz^2]: of a sine in white noise, var(2 pi f) = 12 v/(A T)^2 with v the
         variance of the cosine or sine amplitude (Rife and Boorstyn 1974), times the cost of the window."""
-        if not self.variance:  # a channel that is constant in this record
-            return 0.0
         A2 = (4 * self.mean(shift_Hz)) ** 2
         size = max(A2 - 2 * self.variance, 0.0) / self.variance
         return (2 * np.pi * self.harmonic * self.duration_s) ** 2 * size / 12 / HANN_COST
 
 
 def _demodulated(one: RecordResidual, f0: float, hits: np.ndarray) -> list[_Demodulated]:
-    """Significant lines of a record; about 64 values each make the fine search cheap."""
+    """Significant lines of a record, without channels that are constant; about 64 values each make the fine search
+    cheap."""
     n, rate = one.header.samples, one.header.sample_rate_Hz
     window, block, found = hann(n, sym=False), max(n // 64, 1), []
     for k, j in hits:
+        variance = float(_spread(one, (k + 1) * f0)[j])
+        if not variance:
+            continue
         turned = one.e[:, j] * window * np.exp(-2j * np.pi * (k + 1) * f0 / rate * np.arange(n))
         coarse = turned[: n // block * block].reshape(-1, block).mean(axis=1)
         t = (np.arange(len(coarse)) * block + (block - 1) / 2) / rate
-        found.append(_Demodulated(int(k) + 1, t, coarse, float(_spread(one, (k + 1) * f0)[j]), n / rate))
+        found.append(_Demodulated(int(k) + 1, t, coarse, variance, n / rate))
     return found
 
 
@@ -292,7 +294,7 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
 
     def best(lines: Sequence[_Demodulated]) -> float:
         found = optimize.minimize_scalar(
-            lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines if one.variance),
+            lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines),
             bounds=(-reach, reach),
             method="bounded",
             options={"xatol": 1e-5 * reach},
