@@ -314,27 +314,27 @@ class Assembled:
         return inside, g * (1 - share) / (g + (s / w) ** 2)
 
     @cached_property
-    def _state_counts(self) -> tuple[int, ...]:
-        """Numbers of initial states of each kind, in the order of `forces_of_states`: impulses on modes, masses inside
-        mounts, chassis and states defined by effects; steps on the same; first-order states."""
-        ops, chassis = self.ops, 0 if self.ops.recoil is None else self._moves.shape[2]
-        by_effects, decays = (sum(one.shape[2] for one in states) for states in (ops.inner, ops.decays))
-        impulses = (self.n_q - N_Q, len(self._masses_inside[0]), chassis, by_effects)
-        return (*impulses, *impulses, decays)
+    def _owners(self) -> tuple[list[int], ...]:
+        """Owners of the initial states of each kind, in the order of `forces_of_states`: impulses on modes (added
+        coordinate), masses inside (mount), chassis (coordinate) and states defined by effects (count); steps on the
+        same; first-order states (count)."""
+        by_effects, decays = (range(sum(one.shape[2] for one in own)) for own in (self.ops.inner, self.ops.decays))
+        chassis = np.flatnonzero(self._can_move)
+        impulses = [list(map(int, own)) for own in (range(self.n_q - N_Q), self._masses_inside[0], chassis, by_effects)]
+        return (*impulses, *impulses, list(decays))
 
     def _by_kind(self, inner: np.ndarray) -> list[np.ndarray]:
-        """Initial states (m,) by the kinds of `_state_counts`."""
-        return np.split(inner, np.cumsum(self._state_counts)[:-1])
+        """Initial states (m,) by the kinds of `_owners`."""
+        return np.split(inner, np.cumsum([len(own) for own in self._owners])[:-1])
 
     def states_of(self, fewer: Assembled, inner: np.ndarray) -> np.ndarray:
         """(m,) initial states (`forces_of_states`) of the table before its last effect was added, in the order of this
         table; those of that effect are zero."""
-        return np.concatenate(
-            [
-                np.pad(own, (0, count - len(own)))
-                for own, count in zip(fewer._by_kind(inner), self._state_counts, strict=True)
-            ]
-        )
+        known = [
+            dict(zip(own, values, strict=True))
+            for own, values in zip(fewer._owners, fewer._by_kind(inner), strict=True)
+        ]
+        return np.array([one.get(k, 0.0) for one, own in zip(known, self._owners, strict=True) for k in own])
 
     def push_of_masses_inside(self, inner: np.ndarray) -> np.ndarray:
         """(n, n_g, 1) force of the mounts on the payload due to the initial states of the masses inside them
@@ -346,10 +346,15 @@ class Assembled:
         return found
 
     @property
+    def _can_move(self) -> np.ndarray:
+        """(6,) whether the chassis can move along each coordinate."""
+        return np.zeros(N_Q, bool) if self.ops.recoil is None else np.any(self.ops.recoil, axis=(0, 1))
+
+    @property
     def _moves(self) -> np.ndarray:
         """(n, 6, m) chassis displacement per unit force in the directions in which it can move."""
         assert self.ops.recoil is not None
-        return self.ops.recoil[:, :, np.any(self.ops.recoil, axis=(0, 1))]
+        return self.ops.recoil[:, :, self._can_move]
 
     def _chassis_states(self, inner: np.ndarray) -> np.ndarray:
         """(n, 6, 1) chassis displacement due to the chassis' own part of the initial states of `forces_of_states`."""

@@ -168,19 +168,19 @@ def fit_or_none(
 
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> list[Step]:
-    """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance come last:
-    they show in how far one of them had to move, hardly in the residual.
+    """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance are searched
+    again at the end: they show in how far one of them had to move, hardly in the residual.
 
     base : the initial fit, which may already contain effects. The last step has the fit with all effects found.
     """
     steps: list[Step] = []
     settings, progress = run.settings, run.progress
 
-    def more(effects: Sequence[Effect], most: int) -> None:
-        while len(base.labels) + len(steps) < most:
+    def more(effects: Sequence[Effect]) -> None:
+        while True:
             now = steps[-1].fitted if steps else base
-            progress(f"search for effect {len(base.labels) + len(steps) + 1}")
-            step = next_effect(now, data, effects, run)
+            progress(f"search for effect {len(now.labels) + 1}")
+            step = next_effect(now, data, searched(now, effects, settings), run)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -188,16 +188,26 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
             steps.append(step)
             progress(f"  best model: {', '.join(step.fitted.labels)}")
 
-    more(effects, settings.longest)
+    more(effects)
     for _ in range(settings.revisions):
         progress("comparison of each effect with its rivals, given the effects found later")
         if not _revised(steps, data, settings):
             break
-        more(effects, settings.longest)
+        more(effects)
     values = of_values(effects, base.model)
     if steps and len(values) < len(effects):  # otherwise they have just been searched
-        more(values, len(base.labels) + len(steps) + settings.longest)
+        more(values)
     return steps
+
+
+def searched(now: Fitted, effects: Sequence[Effect], settings: GapSettings) -> list[Effect]:
+    """Effects that may be added to a fit: at most `longest` of the library, and as many values beyond their
+    tolerance."""
+    values = of_values(effects, now.model)
+    names = {one.name for one in values}
+    found = sum(one.effect.name in names for one in map(now.model.effect, now.labels))
+    full = (found >= settings.longest, len(now.labels) - found >= settings.longest)  # values, others
+    return [one for one in effects if not full[one.name not in names]]
 
 
 def outliers(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> tuple[list[Step], Fitted]:
@@ -213,7 +223,7 @@ def outliers(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> tu
     run.progress(f"search for values that stand out from the others, which moved by {size:.2f} tolerances")
     steps: list[Step] = []
     narrow, beyond = _with_spread(now, rows, size, data, settings), of_values(effects, now.model)
-    while len(narrow.labels) < settings.longest and (step := next_effect(narrow, data, beyond, run)):
+    while step := next_effect(narrow, data, searched(narrow, beyond, settings), run):
         steps.append(step)
         narrow = step.fitted
     return steps, _with_spread(narrow, rows, 1 / size, data, settings) if steps else now

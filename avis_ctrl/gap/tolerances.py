@@ -20,7 +20,7 @@ from avis_ctrl.rigs.instruments import Tolerances
 
 Stated = Callable[[Tolerances, Sequence[EffectParameter]], tuple[float, ...]]
 # Effects that represent one value of the rig file beyond its tolerance: the tolerance of each of their parameters, in
-# its unit, and the names of these tolerances; a name that ends in "." or "_" is the start of several.
+# its unit, zero without one; and the names of these tolerances. A name that ends in "." or "_" is the start of several.
 BEYOND: Mapping[str, tuple[Stated, tuple[str, ...]]] = {
     "sensor_gain": (lambda t, p: (t.sensor_gain_percent / 100,), ("sensor.{place}",)),
     "actuator_gain": (lambda t, p: (t.actuator_gain_percent / 100,), ("actuator.{place}",)),
@@ -31,8 +31,12 @@ BEYOND: Mapping[str, tuple[Stated, tuple[str, ...]]] = {
         lambda t, p: (t.sensor_corner_percent / 100 * p[0].none, t.sensor_damping_percent / 100 * p[1].none),
         ("corner.{place}", "damping.{place}"),
     ),
-    # The lower limit is the difference between no lag and the expected one; zero if none is expected.
-    "actuator_lag": (lambda t, p: (lag_tolerance(-p[0].low) if p[0].low else 0.0,) * len(p), (AMPLIFIERS,)),
+    # The lower limit is the difference between no lag and the expected one; zero if none is expected. How much the
+    # drives differ has no tolerance.
+    "actuator_lag": (
+        lambda t, p: (lag_tolerance(-p[0].low) if p[0].low else 0.0, *[0.0] * (len(p) - 1)),
+        (AMPLIFIERS,),
+    ),
 }
 
 
@@ -119,10 +123,10 @@ def moved(fitted: Fitted, names: Sequence[str], tolerances: Tolerances, settings
         if not behind:
             continue
         priors = rescaled(fitted.priors, effect, 1 / settings.held).of(behind)
-        size = tolerance_of(effect, tolerances)
-        std = np.sqrt(np.diag(fitted.covariance_of(effect.names))) / size
-        none = np.array([p.none for p in effect.parameters])
-        away = np.array(effect.values) - none
+        size = tolerance_of(effect, tolerances)[: len(behind)]
+        std = np.sqrt(np.diag(fitted.covariance_of(effect.names)))[: len(behind)] / size
+        none = np.array([p.none for p in effect.parameters])[: len(behind)]
+        away = np.array(effect.values)[: len(behind)] - none
         # The logarithm of a positive value has the normal prior.
         z = (
             np.array(
@@ -159,6 +163,7 @@ def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSetting
         ]
     )
     if has_tolerance(effect, tolerances):
-        sigma = settings.beyond_tolerance * tolerance_of(effect, tolerances)
+        stated = tolerance_of(effect, tolerances)
+        sigma = np.where(stated > 0, settings.beyond_tolerance * stated, sigma)
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))
     return Priors(effect.names, mean, sigma, np.zeros(len(mean), bool), low, high)

@@ -40,6 +40,14 @@ def cluster_moves(
     return np.array(found)
 
 
+def widening(ratio: float | np.ndarray, clusters: float) -> np.ndarray:
+    """Factor of the model's variance, for the ratio of the variance from clusters to it: 1 plus the excess, times the
+    square of the 97.5 % quantile of Student's t over that of the normal distribution, because a variance from a few
+    clusters is itself uncertain."""
+    t = stats.t.ppf(0.975, max(clusters - 1, 1)) / stats.norm.ppf(0.975)
+    return np.asarray(1 + t**2 * np.maximum(np.asarray(ratio) - 1, 0.0))
+
+
 @dataclass(frozen=True, eq=False)
 class ClusterCovariance:
     """Covariance (n, n) of all parameters from the differences between clusters, and their number."""
@@ -47,20 +55,13 @@ class ClusterCovariance:
     covariance: np.ndarray
     clusters: float
 
-    def widening(self, ratio: np.ndarray) -> np.ndarray:
-        """Factor of the model's variance, for the ratio of the variance from clusters to it: 1 plus the excess, times
-        the square of the 97.5 % quantile of Student's t over that of the normal distribution, because a variance from a
-        few clusters is itself uncertain."""
-        t = stats.t.ppf(0.975, max(self.clusters - 1, 1)) / stats.norm.ppf(0.975)
-        return np.asarray(1 + t**2 * np.maximum(ratio - 1, 0.0))
-
     def covering(self, A: np.ndarray, rows: Sequence[int]) -> np.ndarray:
         """(k, k) covariance of some parameters, at least as large as A in every direction: A, increased by
         `widening`. A : (k, k), positive definite."""
         L = np.linalg.cholesky(A)
         B = self.covariance[np.ix_(rows, rows)]
         ratio, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, B).T))
-        root = L @ (vectors * np.sqrt(self.widening(ratio)))
+        root = L @ (vectors * np.sqrt(widening(ratio, self.clusters)))
         return np.asarray(root @ root.T)
 
 

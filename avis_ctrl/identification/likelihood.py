@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import log_ndtr
 
 from avis_ctrl.errors import InputError
-from avis_ctrl.identification.clusters import ClusterCovariance, cluster_moves, clusterings
+from avis_ctrl.identification.clusters import ClusterCovariance, cluster_moves, clusterings, widening
 from avis_ctrl.identification.fit_settings import SETTINGS, FitSettings
 from avis_ctrl.identification.maximum_likelihood import (
     as_complex,
@@ -151,7 +151,7 @@ class Fitted:
         """(n,) standard deviations of z, as those of `covariance_of`."""
         variance = self.weight_cost * np.diag(self.covariance)
         for robust in self._by_clusters:
-            variance = variance * robust.widening(np.diag(robust.covariance) / variance)
+            variance = variance * widening(np.diag(robust.covariance) / variance, robust.clusters)
         return np.sqrt(variance)
 
     @cached_property

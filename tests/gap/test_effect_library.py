@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,10 @@ from avis_ctrl.gap.effects.library import library
 from avis_ctrl.gap.effects.mounts import drifted
 from avis_ctrl.gap.motion_estimate import mount_rows
 from avis_ctrl.gap.record_motion import RecordMotion
+from avis_ctrl.gap.search import searched
 from avis_ctrl.gap.settings import SETTINGS
 from avis_ctrl.gap.table_model import TableModel, active
-from avis_ctrl.gap.tolerances import has_tolerance, of_values, within_tolerance
+from avis_ctrl.gap.tolerances import has_tolerance, of_effect, of_values, within_tolerance
 from avis_ctrl.identification.maximum_likelihood import block_residual, whitener
 from avis_ctrl.identification.parameter_sets import default_parameters
 from avis_ctrl.identification.priors import tolerances_of
@@ -309,6 +311,35 @@ def test_a_lag_is_a_value_with_a_tolerance_only_if_the_model_has_one():
         lag = active(library()["actuator_lag"], known, "actuators", [difference])
         assert has_tolerance(lag, stated) and within_tolerance(lag, stated, SETTINGS) == within
     assert not has_tolerance(active(library()["actuator_lag"], BARE, "actuators", [1e-3]), stated)
+
+
+def test_drives_may_differ_where_a_lag_is_expected():
+    """The tolerance in seconds is that of the mean; the differences have the same prior as without an expected lag."""
+    known = replace(BARE, base=replace(BARE.base, amplifier_corner_Hz=300.0))
+    each = [active(library()["actuator_lag"], one, "actuators/each") for one in (known, BARE)]
+    stated = tolerances_of(RIG)
+    with_lag, without = (of_effect(one, stated).sigma for one in each)
+    assert len(with_lag) == len(BARE.actuators) and with_lag[0] < without[0]
+    assert np.all(with_lag[1:] == 0.1) and np.all(without[1:] == 0.1)
+    differ = each[0].at([0.0, 0.2, *[0.0] * (len(with_lag) - 2)])
+    assert not within_tolerance(differ, stated, SETTINGS)
+
+
+def test_values_beyond_their_tolerance_and_other_effects_have_their_own_places():
+    effects, settings = [library()[name] for name in ("sensor_gain", "loop_delay")], replace(SETTINGS, longest=2)
+
+    def may_follow(*names):
+        model = BARE
+        for name, place in names:
+            model = model.with_effect(active(library()[name], model, place))
+        return [one.name for one in searched(SimpleNamespace(model=model, labels=model.labels), effects, settings)]
+
+    gains = [("sensor_gain", "Sz1"), ("sensor_gain", "Sz2")]
+    others = [("structural_damping", "isolators/causal"), ("mount_relaxation", "isolators z")]
+    assert may_follow() == may_follow(gains[0], others[0]) == ["sensor_gain", "loop_delay"]
+    assert may_follow(*gains, others[0]) == ["loop_delay"]
+    assert may_follow(*others, gains[0]) == ["sensor_gain"]
+    assert may_follow(*others, *gains) == []
 
 
 # --- amplitude and time

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from avis_ctrl.gap.effects.base import Effect, EffectParameter
+from avis_ctrl.gap.effects.impedance import recoils
 from avis_ctrl.gap.effects.library import library
-from avis_ctrl.gap.score import Score, reduction
+from avis_ctrl.gap.effects.sensors import receptance
+from avis_ctrl.gap.score import Part, Score, reduction
 from avis_ctrl.gap.starting_values import seeds
 from avis_ctrl.gap.table_model import TableModel, active
 from avis_ctrl.identification.maximum_likelihood import fit
@@ -192,6 +196,48 @@ def test_a_direction_is_the_derivative_of_the_response_to_all_initial_states(kno
 
     expected = (response(small) - response(one.at(zero))) / step
     np.testing.assert_allclose(part.change(small) / step, expected, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("heavy", [False, True], ids=["bare payload", "beside 30 kg on springs"])
+def test_the_direction_of_a_chassis_is_its_whole_recoil(heavy):
+    """A chassis of 1e9 kg: its recoil is small, so that the response is proportional to it. The force on it includes
+    that of elements attached to the payload."""
+    model = MODEL
+    if heavy:
+        model = model.with_effect(effect("attached_oscillator", "payload/z", [30.0, 12.0, 0.05, 0.3, 0.2]))
+    score, mass, each = Score(model, [block(model, np.random.default_rng(2))]), 1e9, (12.0, 17.0, 25.0)
+    chassis = effect("base_compliance", "chassis/translation", [mass, 0.06, *each], model)
+    whole = score.directions([part.whole_change(chassis)[None] for part in score.parts])[0]
+    found = sum(recoils(score, partial(receptance, frequency_Hz=f, damping=0.06))[k] / mass for k, f in enumerate(each))
+    np.testing.assert_allclose(found, whole, atol=1e-4 * np.abs(whole).max())
+
+
+class MassInHorizontalMounts(Effect):
+    """An effect of a user that precedes the masses in the vertical mounts."""
+
+    name, title, looks_like, at = (
+        "horizontal_surge",
+        "a mass inside the mounts along x",
+        "a resonance",
+        ("isolators x",),
+    )
+
+    def parameters(self, model, place):
+        return (EffectParameter.shape("frequency_Hz", "Hz", "of the mass", 1.0, 1e9, 10.0, (40.0,)),)
+
+    def change(self, ops, place, values):
+        ops.internal_omega = np.where(ops.mounts.along("x"), 2 * np.pi * values["frequency_Hz"], ops.internal_omega)
+
+
+def test_initial_states_of_other_mounts_keep_their_mounts():
+    """A very small mass in other mounts changes nothing, with any initial motion of those in the vertical mounts."""
+    rng, (known, at, values) = np.random.default_rng(8), WITH_STATES[3]
+    model = MODEL.with_effect(effect(known, at, values))
+    made, states = block(model, rng), model.inner_transients(OMEGA).shape[2]
+    part = Part(model, made, None, rng.standard_normal(states))
+    assert np.abs(part.response.Y - model.answer(made, None, False).Y).max() > 0.1 * np.abs(part.response.Y).max()
+    change = part.whole_change(active(MassInHorizontalMounts(), model, "isolators x", [1e7]))
+    assert np.abs(change).max() < 1e-6 * np.abs(part.response.Y).max()
 
 
 def inner_states(score: Score, one) -> list[np.ndarray]:

@@ -80,16 +80,32 @@ def test_a_harmonic_of_both_mains_does_not_hide_which_it_is(f0, nominal):
 
 
 def test_frequency_error_is_as_large_as_it_says():
-    """50 draws of a weak line in white noise: the pull has unit variance."""
+    """50 draws of a weak line in white noise, in one record: the pull has unit variance."""
     t, pull = np.arange(10_000) / FS, []
     for seed in range(50):
         added = np.zeros((10_000, 6))
-        added[:, 2] = 0.3 * np.sin(2 * np.pi * 50.07 * t + seed)
-        found = find_hum(white(seed, 2, added=added))
+        added[:, 2] = 0.4 * np.sin(2 * np.pi * 50.07 * t + seed)
+        found = find_hum(white(seed, 1, added=added))
         assert found is not None
         pull.append((found.frequency_Hz.value - 50.07) / found.frequency_Hz.std)
     # Chi-square of 50: 0.6 to 1.55 hold 99.9 %.
     assert 0.6 < np.mean(np.square(pull)) < 1.55
+
+
+def test_intervals_cover_the_scatter_between_few_records():
+    """The frequency of the mains differs by 2 mHz r.m.s. between three records, of which one is three times as long.
+
+    Of 200 intervals that cover 95 %, less than 180 cover with a chance of 2e-3."""
+    inside = 0
+    for seed in range(200):
+        rng = np.random.default_rng([6, seed])
+        records = [white(3 * seed + k, 1, samples)[0] for k, samples in enumerate((90_000, 30_000, 30_000))]
+        for one, f in zip(records, 50.01 + 2e-3 * rng.standard_normal(3), strict=True):
+            one.e[:, 0] += 5.0 * np.sin(2 * np.pi * f * np.arange(len(one.e)) / FS)
+        found = find_hum(records)
+        assert found is not None
+        inside += abs(found.frequency_Hz.value - 50.01) < 1.96 * found.frequency_Hz.std
+    assert inside >= 180
 
 
 def test_errors_cover_the_scatter_between_records():

@@ -139,14 +139,15 @@ def recoil_of(score: Score, recoil: Callable[[np.ndarray], np.ndarray]) -> np.nd
 
 
 def _through_chassis(score: Score) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For each block (n, n_y, 6) y per displacement of the chassis, and (n, 6, m) the force of the payload on it."""
+    """For each block (n, n_y, 6) y per displacement of the chassis, and (n, 6, m) the force on it of the payload with
+    all that is attached."""
     if "through chassis" not in score.kept:
         found = []
         for part in score.parts:
             made, response = part.made, part.response
             through = np.swapaxes(made.G, 0, 1)[:6] @ (made.z_pf[:, :, None] * made.ops.mounts.chassis)
             moved = response.left[:, :, :6] @ through - response.gain * response.sense * made.ops.against
-            found.append((moved, -(part.s**2) * (made.M @ response.x[:, :6])))
+            found.append((moved, -made.ops.borne(made.M) @ response.x[:, :6]))
         score.kept["through chassis"] = found
     return score.kept["through chassis"]
 

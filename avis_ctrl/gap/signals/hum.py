@@ -11,6 +11,7 @@ channels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ from scipy.signal.windows import hann
 
 from avis_ctrl.gap.effects.base import Reported
 from avis_ctrl.gap.signals.record_residual import RecordResidual
+from avis_ctrl.identification.clusters import widening
 
 MAINS_HZ = (50.0, 60.0)
 # int w^2 t^2 dt / (int w t^2 dt)^2 of a Hann window over the same without window: 28.1 / 12.
@@ -285,14 +287,13 @@ def _demodulated(one: RecordResidual, f0: float, hits: np.ndarray) -> list[_Demo
 def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray) -> Reported:
     """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
-    Its variance is that of sines in noise (`_Demodulated.information`) or that from the scatter between the records,
-    whichever is larger, because the frequency of the mains varies by some mHz. With few records, or one that is much
-    longer than the others, the scatter is not known well.
+    Its variance is that of sines in noise (`_Demodulated.information`), increased by the scatter between the records
+    (`_pooled`): the frequency of the mains varies by some mHz.
     """
     records = [_demodulated(one, start, hits) for one in residuals]
-    reach = 1.0 / max(one.header.duration_s for one in residuals)
 
     def best(lines: Sequence[_Demodulated]) -> float:
+        reach = 1 / max(one.duration_s for one in lines)
         found = optimize.minimize_scalar(
             lambda shift: -sum(one.mean(shift) ** 2 / one.variance for one in lines),
             bounds=(-reach, reach),
@@ -302,19 +303,37 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
         return float(found.x)
 
     shift = best([one for lines in records for one in lines])
-    each = np.array([best(lines) for lines in records])
-    weights = np.array([float(sum(one.information(shift) for one in lines)) for lines in records])
-    return Reported(start + shift, _std_of_mean(each - shift, weights), "Hz")
+    each = np.array([best(lines) if lines else shift for lines in records])
+    information = np.array([float(sum(one.information(shift) for one in lines)) for lines in records])
+    more, std = _pooled(each - shift, _inverse(information))
+    return Reported(start + shift + more, std, "Hz")
 
 
-def _std_of_mean(difference: np.ndarray, weights: np.ndarray) -> float:
-    """Standard deviation of a mean with weights that are inverse variances (n,), from these or, if larger, from the
-    scatter of the values about the mean, difference (n,). With one value, there is no scatter."""
-    total = max(float(weights.sum()), 1e-30)
-    share = weights / total
-    known = 1 - float(share @ share)  # of the scatter, after the mean was fitted to the values
-    scatter = float(np.sum((share * difference) ** 2)) / known if known > 1e-9 else 0.0
-    return float(np.sqrt(max(1 / total, scatter)))
+def _inverse(weights: np.ndarray) -> np.ndarray:
+    """Variances of weights, infinite where there is none."""
+    return np.divide(1.0, weights, out=np.full_like(weights, np.inf), where=weights > 0)
+
+
+def _pooled(difference: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
+    """Mean, and its standard deviation, of values (n,) about zero with their variances (n,), infinite for a value that
+    is not known.
+
+    If the values differ by more than their variances explain, their own variance is added (DerSimonian and Laird,
+    Controlled Clinical Trials 7 (1986) 177-188), so that one record among several does not determine the mean by
+    itself; otherwise the mean is zero. One value shows no scatter.
+    """
+    known = np.isfinite(variance)
+    d, weights = difference[known], 1 / variance[known]
+    if not len(d):
+        return 0.0, math.inf
+    total, more = float(weights.sum()), len(d) - 1
+    excess = float(weights @ (d - weights @ d / total) ** 2) - more
+    between = excess / (total - float(weights @ weights) / total) if more and excess > 0 else 0.0
+    if not between:
+        return 0.0, 1 / math.sqrt(total)
+    weights = 1 / (variance[known] + between)
+    std = np.sqrt(widening(total / float(weights.sum()), len(d)) / total)
+    return float(weights @ d / weights.sum()), float(std)
 
 
 def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
@@ -334,6 +353,7 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
         i = ks.index(int(k) + 1)
         amplitude = float(np.sqrt(max(power[i, j], 0.0)))
         difference = np.sqrt(np.maximum(sizes[:, i, j], 0.0)) - amplitude
-        size = Reported(amplitude, _std_of_mean(difference, weights[:, i, j]), unit)
+        more, std = _pooled(difference, _inverse(weights[:, i, j]))
+        size = Reported(amplitude + more, std, unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
