@@ -90,9 +90,12 @@ def each_its_own_corner(d: Draw, p: Parameters, x: Details) -> None:
 
 
 def second_order(d: Draw, p: Parameters, x: Details) -> None:
-    """Two poles; the effective corner is that of a single pole of the same delay at low frequency."""
-    share = float(d.rng.uniform(0.55, 0.85))  # of the delay, in the slower pole
-    x["poles"] = [1 / share, 1 / (1 - share)]
+    """Two poles in each amplifier, not quite the same in all; the effective corner gives the mean delay of all channels
+    at low frequency."""
+    share = d.rng.uniform(0.55, 0.85) + d.rng.uniform(-0.04, 0.04, 8)  # of the delay, in the slower pole
+    x.update(
+        poles=[(1 / share).tolist(), (1 / (1 - share)).tolist()], uneven=(1 / np.array(uneven(d, 0.1, 8))).tolist()
+    )
 
 
 def each_its_own_limit(d: Draw, p: Parameters, x: Details) -> None:
