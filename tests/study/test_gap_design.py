@@ -222,6 +222,19 @@ def test_files_say_what_they_do_not_hold(baseline, design):
     assert found.inside == () and found.outside == ("mount_relaxation@isolators z",)
 
 
+@pytest.mark.parametrize(
+    ("name", "place", "values"),
+    [
+        ("actuator_lag", "actuators/two", (4e-3, 0.7)),
+        ("actuator_lag", "actuators/each", (4e-3, 0.2, *(0.0,) * 6)),
+        ("actuator_saturation", "actuators/each", (2.0, 0.1, *(0.0,) * 6)),
+    ],
+)
+def test_files_hold_one_pole_and_one_limit_for_all_drives(baseline, design, name, place, values):
+    found = design_files(design, with_one(baseline, name, place, values))
+    assert found.inside == () and found.outside == (f"{name}@{place}",)
+
+
 class SensorLowpass(Effect):
     """A user's own effect without a state space (docs/own_effect.md)."""
 
