@@ -85,6 +85,14 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
     return list(chosen.values())[: settings.refits]
 
 
+def nearly_best(fits: Mapping[str, Fitted], before: Fitted, settings: GapSettings) -> list[str]:
+    """Labels of the fits that raise the log evidence nearly as much as the best one, which is among them even if its
+    parameters cost more than they gain."""
+    most = max(one.log_evidence for one in fits.values())
+    least = min(before.log_evidence + settings.near_best * (most - before.log_evidence), most)
+    return [label for label, one in fits.items() if one.log_evidence >= least]
+
+
 def other_laws(found: Sequence[Candidate], best: Collection[str], fitted: Collection[str]) -> list[Candidate]:
     """The same effects at the same places with their other laws, except those already fitted; `best` and `fitted` are
     labels."""
@@ -345,9 +353,10 @@ def _compared(
         return {}, len(found)
     better, best, asked = tried, _likeliest(tried, settings), set(tried)
     while better:
-        least = now.log_evidence + settings.near_best * (tried[best].log_evidence - now.log_evidence)
-        rivals = [label for label, one in tried.items() if one.log_evidence >= least]
-        further = [*extensions(list(better.values()), data, settings), *other_laws(found, rivals, asked)]
+        further = [
+            *extensions(list(better.values()), data, settings),
+            *other_laws(found, nearly_best(tried, now, settings), asked),
+        ]
         asked |= {one.effect.label for one in further}
         if further:
             run.progress(f"  {len(further)} more forms of the best candidates are fitted")
