@@ -348,10 +348,13 @@ def _compared(
     found = candidates(begun, data, effects, run)
     short = shortlist(found, settings)
     run.progress(f"  {len(found)} candidates ranked by the score test, the best {len(short)} are fitted")
+    asked = {one.effect.label for one in short}
     tried = _tried(begun, short, data, run)
+    if not tried:  # values that physics forbids in one law may be possible in another
+        tried = _tried(begun, other_laws(found, asked, asked), data, run)
     if not tried:
         return {}, len(found)
-    better, best, asked = tried, _likeliest(tried, settings), set(tried)
+    better, best, asked = tried, _likeliest(tried, settings), asked | tried.keys()
     while better:
         further = [
             *extensions(list(better.values()), data, settings),
