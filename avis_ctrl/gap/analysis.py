@@ -1,7 +1,7 @@
 """Gap analysis of a rig and a campaign, from the signals to the verdict.
 
-prepare -> fit of rig -> fit with tolerances -> search -> motion of the records again -> naming -> stages, power
-fractions and residual
+prepare -> fit of rig -> fit with tolerances -> search -> motion of the records again -> naming (-> search from the rig
+file, if the fit moved its values too far) -> stages, power fractions and residual
 """
 
 from __future__ import annotations
@@ -51,10 +51,11 @@ from avis_ctrl.summary import joined, percent
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """base : fit of the re-identified rig. tolerant : fit with all tolerances. steps : of the search. best : fit with
-    all effects."""
+    """base : fit of the re-identified rig. at_file : the same, with all values that have a tolerance free, not fitted.
+    tolerant : fit with all tolerances. steps : of the search. best : fit with all effects."""
 
     base: Fitted
+    at_file: Fitted
     tolerant: Fitted
     steps: tuple[Step, ...]
     best: Fitted
@@ -107,22 +108,33 @@ def analyse(
         prepared = mended_with(prepared, fits.best.model)
         del fits  # with the motion in every record, which takes much memory
         fits = _fits(prepared, rig, known)
+    prepared, fits, names = _completed(prepared, fits, known)
+    if not credible(names.updated, settings):
+        progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
+        again = _searched_from_file(fits, prepared, known)
+        if again is not fits:
+            prepared, fits, names = _completed(prepared, again, known)
+    return _gap(prepared, fits, names, known, seed, began)
+
+
+def _completed(prepared: Prepared, fits: Fits, effects: Sequence[Effect]) -> tuple[Prepared, Fits, Names]:
+    """Noise and motion estimated again with the model that was found, the fits with them, and the names."""
+    settings, progress = prepared.run.settings, prepared.run.progress
     residual = ModelResidual.of(fits.best.model, prepared.held_out)
     if prepared.local_noise and residual.noise_nrmse**2 > settings.within_noise * residual.nrmse**2:
         # A local polynomial model counts distortion as noise; the model with its effects may predict it.
         progress("noise estimated again, with the effects that were found")
         prepared = with_noise_from(prepared, fits.best.model)
-        fits = _refitted(fits, prepared, known)
+        fits = _refitted(fits, prepared, effects)
     if any(fits.best.model.effect(label).effect.nonlinear for label in fits.best.labels):
         progress("motion of the table estimated again, with the effects that were found")
         prepared = with_motion_of(prepared, fits.best.model)
         fits = _with_motion(fits, prepared)
     steps, best = _without_weak(fits.steps, fits.best, prepared.fit_data, settings)
-    more, best = outliers(best, prepared.fit_data, known, prepared.run)
+    more, best = outliers(best, prepared.fit_data, effects, prepared.run)
     fits = replace(fits, steps=(*steps, *more), best=best)
     progress("validation of the effects on held-out records")
-    names = _names(fits, prepared)
-    return _gap(prepared, fits, names, known, seed, began)
+    return prepared, fits, _names(fits, prepared)
 
 
 def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
@@ -142,20 +154,17 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     )
     priors = tolerances.followed_by(large)
     tolerant = fit(apart, priors, priors.z(apart.values), data, base.variances, settings)
-    fits = _searched(Fits(base, tolerant.bare(), (), tolerant), prepared, effects)
-    if credible(fits.best, settings):
-        return fits
-    progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
-    return _searched_from(replace(tolerant, model=apart, z=priors.z(apart.values)), fits, prepared, effects)
+    at_file = replace(tolerant.bare(), model=apart, z=priors.z(apart.values))
+    return _searched(Fits(base, at_file, tolerant.bare(), (), tolerant), prepared, effects)
 
 
-def _searched_from(at_file: Fitted, fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
+def _searched_from_file(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
     """The better of two searches, the second of which starts from the values of the rig file.
 
     Values that moved further than their tolerances allow may compensate for a missing effect.
     """
     data = prepared.fit_data
-    step = next_effect_from(at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
+    step = next_effect_from(fits.at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
     if step is None:
         return fits
     least = prepared.run.settings.certain + math.log(step.candidates)
@@ -194,7 +203,7 @@ def _with_motion(fits: Fits, prepared: Prepared) -> Fits:
         for step in fits.steps
     )
     best = refit(moved(fits.best), prepared.fit_data, prepared.run.settings)
-    return Fits(moved(fits.base), moved(fits.tolerant), tuple(steps), best)
+    return Fits(moved(fits.base), moved(fits.at_file), moved(fits.tolerant), tuple(steps), best)
 
 
 def _with_unnamed(effects: Sequence[Effect]) -> list[Effect]:
