@@ -51,8 +51,8 @@ from avis_ctrl.summary import joined, percent
 
 @dataclass(frozen=True, eq=False)
 class Fits:
-    """base : fit of the re-identified rig. at_file : the same, with all values that have a tolerance free, not fitted.
-    tolerant : fit with all tolerances. steps : of the search. best : fit with all effects."""
+    """base : fit of the re-identified rig. at_file : model and parameters with the values of the rig file, from which
+    fits start. tolerant : fit with all tolerances. steps : of the search. best : fit with all effects."""
 
     base: Fitted
     at_file: Fitted
@@ -111,9 +111,11 @@ def analyse(
     prepared, fits, names = _completed(prepared, fits, known)
     if not credible(names.updated, settings):
         progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
-        again = _searched_from_file(fits, prepared, known)
-        if again is not fits:
-            prepared, fits, names = _completed(prepared, again, known)
+        again = _searched_from_file(fits, names.updated, prepared, known)
+        if again is not None:
+            found = _completed(prepared, again, known)
+            if found[2].updated.labels or not names.updated.labels:
+                prepared, fits, names = found
     return _gap(prepared, fits, names, known, seed, began)
 
 
@@ -158,22 +160,27 @@ def _fits(prepared: Prepared, rig: Rig, effects: Sequence[Effect]) -> Fits:
     return _searched(Fits(base, at_file, tolerant.bare(), (), tolerant), prepared, effects)
 
 
-def _searched_from_file(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:
-    """The better of two searches, the second of which starts from the values of the rig file.
+def _searched_from_file(fits: Fits, updated: Fitted, prepared: Prepared, effects: Sequence[Effect]) -> Fits | None:
+    """A search that starts from the values of the rig file; None if its model is no better than the updated one.
 
     Values that moved further than their tolerances allow may compensate for a missing effect.
     """
-    data = prepared.fit_data
-    step = next_effect_from(fits.at_file, fits.base, fits.tolerant, data, _with_unnamed(effects), prepared.run)
+    data, settings = prepared.fit_data, prepared.run.settings
+    # Noise and motion may have been estimated again since these fits.
+    base, tolerant = refit(fits.base, data, settings), refit(fits.tolerant, data, settings)
+    step = next_effect_from(fits.at_file, base, tolerant, data, _with_unnamed(effects), prepared.run)
     if step is None:
-        return fits
-    least = prepared.run.settings.certain + math.log(step.candidates)
-    if step.fitted.log_evidence < fits.tolerant.log_evidence + least:
-        return fits
-    rivals = {**fits.steps[0].tried, **step.tried} if fits.steps else step.tried
-    begun = replace(fits, steps=(replace(step, tried=rivals),), best=step.fitted)
-    again = _searched(begun, prepared, effects)
-    return again if again.best.log_evidence > fits.best.log_evidence + least else fits
+        return None
+    least = settings.certain + math.log(step.candidates)
+    if step.fitted.log_evidence < tolerant.log_evidence + least:
+        return None
+    alone = [one for first in fits.steps[:1] for one in first.tried.values() if len(one.labels) == 1]
+    rivals = {one.labels[0]: refit(one, data, settings.quick).bare() for one in alone}
+    first = replace(step, tried={**rivals, **step.tried})
+    again = _searched(
+        replace(fits, base=base, tolerant=tolerant.bare(), steps=(first,), best=step.fitted), prepared, effects
+    )
+    return again if again.best.log_evidence > updated.log_evidence + least else None
 
 
 def _refitted(fits: Fits, prepared: Prepared, effects: Sequence[Effect]) -> Fits:

@@ -85,10 +85,10 @@ def shortlist(found: Sequence[Candidate], settings: GapSettings) -> list[Candida
     return list(chosen.values())[: settings.refits]
 
 
-def nearly_best(fits: Mapping[str, Fitted], before: Fitted, settings: GapSettings) -> list[str]:
-    """Labels of the fits that raise the log evidence nearly as much as the best one, which is among them even if its
-    parameters cost more than they gain."""
-    most = max(one.log_evidence for one in fits.values())
+def nearly_best(fits: Mapping[str, Fitted], best: str, before: Fitted, settings: GapSettings) -> list[str]:
+    """Labels of the fits that raise the log evidence nearly as much as that of the label `best`, which is among them
+    even if its parameters cost more than they gain."""
+    most = fits[best].log_evidence
     least = min(before.log_evidence + settings.near_best * (most - before.log_evidence), most)
     return [label for label, one in fits.items() if one.log_evidence >= least]
 
@@ -188,7 +188,8 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
         while True:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(now.labels) + 1}")
-            step = next_effect(now, data, searched(now, effects, settings), run)
+            may_follow = searched(now, effects, settings)
+            step = next_effect(now, data, may_follow, run) if may_follow else None
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -209,8 +210,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
 
 
 def searched(now: Fitted, effects: Sequence[Effect], settings: GapSettings) -> list[Effect]:
-    """Effects that may be added to a fit: at most `longest` of the library, and as many values beyond their
-    tolerance."""
+    """Effects that may be added to a fit: at most `longest` values beyond their tolerance, and as many others."""
     values = of_values(effects, now.model)
     names = {one.name for one in values}
     found = sum(one.effect.name in names for one in map(now.model.effect, now.labels))
@@ -349,22 +349,20 @@ def _compared(
     short = shortlist(found, settings)
     run.progress(f"  {len(found)} candidates ranked by the score test, the best {len(short)} are fitted")
     asked = {one.effect.label for one in short}
-    tried = _tried(begun, short, data, run)
-    if not tried:  # values that physics forbids in one law may be possible in another
-        tried = _tried(begun, other_laws(found, asked, asked), data, run)
-    if not tried:
-        return {}, len(found)
-    better, best, asked = tried, _likeliest(tried, settings), asked | tried.keys()
-    while better:
-        further = [
-            *extensions(list(better.values()), data, settings),
-            *other_laws(found, nearly_best(tried, now, settings), asked),
-        ]
+    tried, refused = _tried(begun, short, data, run)
+    better, best = tried, _likeliest(tried, settings) if tried else ""
+    while better or refused:
+        # Values that physics forbids in one law may be possible in another.
+        near = [*refused, *(nearly_best(tried, best, now, settings) if tried else [])]
+        further = [*extensions(list(better.values()), data, settings), *other_laws(found, near, asked)]
         asked |= {one.effect.label for one in further}
         if further:
             run.progress(f"  {len(further)} more forms of the best candidates are fitted")
-        more, before = _tried(begun, further, data, run), tried
+        before = tried
+        more, refused = _tried(begun, further, data, run)
         tried = _likelier([*before.values(), *more.values()])
+        if not tried:
+            continue
         best = _likeliest(tried, settings)
         better = {
             label: one
@@ -372,6 +370,8 @@ def _compared(
             if label not in before
             or (label == best and one.log_evidence - before[label].log_evidence > settings.certain)
         }
+    if not tried:
+        return {}, len(found)
     rise = tried[best].log_evidence - now.log_evidence
     return (tried if rise >= settings.certain + math.log(max(len(found), len(tried))) else {}), len(found)
 
@@ -385,11 +385,12 @@ class _Begun:
     reduction: float
 
 
-def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, run: Run) -> dict[str, Fitted]:
-    """Fits of candidates by label. First the parameters of each effect alone are fitted, the others following to first
-    order; then, for candidates that are not far behind, all parameters."""
+def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, run: Run) -> tuple[dict[str, Fitted], set[str]]:
+    """Fits of candidates by label, and labels of those whose fit failed or has impossible values. First the parameters
+    of each effect alone are fitted, the others following to first order; then, for candidates that are not far behind,
+    all parameters."""
     if not chosen:
-        return {}
+        return {}, set()
     settings = run.settings
     profile = Profile(now, data, settings)
 
@@ -428,7 +429,8 @@ def _tried(now: Fitted, chosen: Sequence[Candidate], data: Data, run: Run) -> di
             and (end is None or end.reduction < settings.least_promised * one.reduction)
         )
     ]
-    return _likelier(_joint_fits(now, near, data, run))
+    found = _likelier(_joint_fits(now, near, data, run))
+    return found, {one.label for one in near} - found.keys()
 
 
 def _joint_fits(now: Fitted, effects: Sequence[ActiveEffect], data: Data, run: Run) -> list[Fitted]:

@@ -54,7 +54,7 @@ class GapSettings(FitSettings):
         candidates, or gives the residual of a stage.
     near_tie : difference of log evidence [nats] up to which candidates are compared by fits to the end: such a fit
         raised the log evidence by up to 170, but by similar amounts for similar candidates.
-    longest : maximum number of effects of the library in a model, and of values beyond their tolerance.
+    longest : maximum number of values beyond their tolerance in a model, and of other effects.
     revisions : how often an effect may be replaced by a rival that is better given the effects found later; twice, for
         a pair that was named wrongly both times.
     certain : gain of log evidence [nats] required for a name, in addition to the logarithm of the number of candidates:

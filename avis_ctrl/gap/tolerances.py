@@ -48,8 +48,8 @@ def of_values(effects: Sequence[Effect], model: TableModel) -> list[Effect]:
 
 
 def has_tolerance(effect: ActiveEffect, tolerances: Tolerances) -> bool:
-    """Whether an effect represents a value with a tolerance."""
-    return effect.effect.name in BEYOND and bool(np.any(tolerance_of(effect, tolerances)))
+    """Whether an effect represents values that all have a tolerance."""
+    return effect.effect.name in BEYOND and bool(np.all(tolerance_of(effect, tolerances)))
 
 
 def tolerance_of(effect: ActiveEffect, tolerances: Tolerances) -> np.ndarray:
@@ -162,7 +162,7 @@ def of_effect(effect: ActiveEffect, tolerances: Tolerances, settings: GapSetting
             for p, v in zip(effect.parameters, effect.values, strict=True)
         ]
     )
-    if has_tolerance(effect, tolerances):
+    if effect.effect.name in BEYOND:
         stated = tolerance_of(effect, tolerances)
         sigma = np.where(stated > 0, settings.beyond_tolerance * stated, sigma)
     low, high = (np.array([getattr(p, name) for p in effect.parameters]) for name in ("low", "high"))

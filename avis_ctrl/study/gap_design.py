@@ -399,9 +399,15 @@ def _remarks(
         places = {label: DESCRIBED_IN.get(by_label[label]) for label in files.inside}
         where = [f"{label} ({place})" if place else label for label, place in places.items()]
         said.append(f"rig.toml and design.toml contain {', '.join(where)}, so `avis design` includes them.")
-    if files.outside:
+    lags = [label for label in files.outside if by_label[label] == "actuator_lag"]
+    if lags:
         said.append(
-            f"Rig and design files cannot contain {', '.join(files.outside)}: the figures here include them, "
+            f"design.toml has one pole for all amplifiers, with the mean lag of {', '.join(lags)}: the figures here "
+            "include each amplifier as it is, `avis design` on these files does not."
+        )
+    if others := [label for label in files.outside if label not in lags]:
+        said.append(
+            f"Rig and design files cannot contain {', '.join(others)}: the figures here include them, "
             "`avis design` on these files does not."
         )
     return said

@@ -35,8 +35,7 @@ from avis_ctrl.study.plant import DesignPlant, Wiring, build_plant
 from avis_ctrl.uncertainty.generalized_plant import Part
 from avis_ctrl.uncertainty.uncertain_rig import Uncertain
 
-# Effects whose linear part a rig or design file can describe, and where. Amplifiers and drive limits are the same for
-# all drives there, with one pole: their other laws (a place with "/") are not described.
+# Effects whose linear part a rig or design file can describe, and where.
 DESCRIBED_IN: Mapping[str, str] = {
     "com_offset": "the rig's centre of mass",
     "product_of_inertia": "the rig's inertia",
@@ -48,8 +47,6 @@ DESCRIBED_IN: Mapping[str, str] = {
     "stiffness_drift": "the rig's stiffness at that moment",
     "contact_friction": "the rig's stiffness far below the slip, and the range of that stiffness covers it too",
 }
-
-SAME_FOR_ALL_DRIVES = ("actuator_lag", "actuator_saturation")
 
 
 @dataclass(frozen=True)
@@ -228,7 +225,8 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
         fits = name in DESCRIBED_IN and (name != "sensor_gain" or rig.gain_per_sensor)
-        fits = fits and not (name in SAME_FOR_ALL_DRIVES and "/" in one.place)
+        # A design has one pole for all amplifiers, of the mean lag.
+        fits = fits and not (name == "actuator_lag" and "/" in one.place)
         (inside if own or fits else outside).append(one.label)
         if name == "actuator_gain":
             key = rig.force_constant(one.place)

@@ -322,7 +322,7 @@ def test_drives_may_differ_where_a_lag_is_expected():
     assert len(with_lag) == len(BARE.actuators) and with_lag[0] < without[0]
     assert np.all(with_lag[1:] == 0.1) and np.all(without[1:] == 0.1)
     differ = each[0].at([0.0, 0.2, *[0.0] * (len(with_lag) - 2)])
-    assert not within_tolerance(differ, stated, SETTINGS)
+    assert not has_tolerance(differ, stated) and not within_tolerance(differ, stated, SETTINGS)
 
 
 @pytest.mark.parametrize(("best", "near"), [(100.0, ["a", "b"]), (-2.0, ["a"])])
@@ -330,7 +330,7 @@ def test_other_laws_of_the_best_are_fitted_even_if_it_gains_nothing(best, near):
     """A law with a value for each drive may come first in the score test and cost more than it gains."""
     fits = {"a": best, "b": 0.9 * best if best > 0 else best - 1, "c": -50.0}
     found = {label: SimpleNamespace(log_evidence=one) for label, one in fits.items()}
-    assert nearly_best(found, SimpleNamespace(log_evidence=0.0), SETTINGS) == near
+    assert nearly_best(found, "a", SimpleNamespace(log_evidence=0.0), SETTINGS) == near
 
 
 def test_values_beyond_their_tolerance_and_other_effects_have_their_own_places():

@@ -175,6 +175,7 @@ def moved(plant, size: float) -> np.ndarray:
         ("product_of_inertia", "Jxy", (4.0,), False),
         ("contact_friction", "actuators", (6e3, 1e-5, *(0.0,) * 7), True),
         ("actuator_saturation", "actuators", (2.0,), True),
+        ("actuator_saturation", "actuators/each", (2.0, 0.1, *(0.0,) * 6), True),
     ],
 )
 def test_the_files_hold_what_they_say(baseline, design, tmp_path, name, place, values, seen):
@@ -224,13 +225,9 @@ def test_files_say_what_they_do_not_hold(baseline, design):
 
 @pytest.mark.parametrize(
     ("name", "place", "values"),
-    [
-        ("actuator_lag", "actuators/two", (4e-3, 0.7)),
-        ("actuator_lag", "actuators/each", (4e-3, 0.2, *(0.0,) * 6)),
-        ("actuator_saturation", "actuators/each", (2.0, 0.1, *(0.0,) * 6)),
-    ],
+    [("actuator_lag", "actuators/two", (4e-3, 0.7)), ("actuator_lag", "actuators/each", (4e-3, 0.2, *(0.0,) * 6))],
 )
-def test_files_hold_one_pole_and_one_limit_for_all_drives(baseline, design, name, place, values):
+def test_files_hold_one_pole_for_all_amplifiers(baseline, design, name, place, values):
     found = design_files(design, with_one(baseline, name, place, values))
     assert found.inside == () and found.outside == (f"{name}@{place}",)
 

@@ -288,7 +288,7 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
     """f0 by least squares over all significant lines, with free amplitudes and phases in each record.
 
     Its variance is that of sines in noise (`_Demodulated.information`), increased by the scatter between the records
-    (`_pooled`): the frequency of the mains varies by some mHz.
+    (`_std_of_mean`): the frequency of the mains varies by some mHz.
     """
     records = [_demodulated(one, start, hits) for one in residuals]
 
@@ -304,9 +304,8 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
 
     shift = best([one for lines in records for one in lines])
     each = np.array([best(lines) if lines else shift for lines in records])
-    information = np.array([float(sum(one.information(shift) for one in lines)) for lines in records])
-    more, std = _pooled(each - shift, _inverse(information))
-    return Reported(start + shift + more, std, "Hz")
+    information = [sum(one.information(own) for one in lines) for own, lines in zip(each, records, strict=True)]
+    return Reported(start + shift, _std_of_mean(each - shift, _inverse(np.array(information, float))), "Hz")
 
 
 def _inverse(weights: np.ndarray) -> np.ndarray:
@@ -314,26 +313,24 @@ def _inverse(weights: np.ndarray) -> np.ndarray:
     return np.divide(1.0, weights, out=np.full_like(weights, np.inf), where=weights > 0)
 
 
-def _pooled(difference: np.ndarray, variance: np.ndarray) -> tuple[float, float]:
-    """Mean, and its standard deviation, of values (n,) about zero with their variances (n,), infinite for a value that
-    is not known.
+def _std_of_mean(difference: np.ndarray, variance: np.ndarray) -> float:
+    """Standard deviation of a mean with the inverse variances as weights; difference (n,) of the values from it,
+    variance (n,) of each, infinite for a value that is not known.
 
-    If the values differ by more than their variances explain, their own variance is added (DerSimonian and Laird,
-    Controlled Clinical Trials 7 (1986) 177-188), so that one record among several does not determine the mean by
-    itself; otherwise the mean is zero. One value shows no scatter.
+    If the values differ by more than their variances explain, each has a variance between records in addition
+    (DerSimonian and Laird, Controlled Clinical Trials 7 (1986) 177-188), so that a record with a large weight does not
+    make the mean certain. One value shows no scatter.
     """
     known = np.isfinite(variance)
     d, weights = difference[known], 1 / variance[known]
     if not len(d):
-        return 0.0, math.inf
+        return math.inf
     total, more = float(weights.sum()), len(d) - 1
-    excess = float(weights @ (d - weights @ d / total) ** 2) - more
-    between = excess / (total - float(weights @ weights) / total) if more and excess > 0 else 0.0
-    if not between:
-        return 0.0, 1 / math.sqrt(total)
-    weights = 1 / (variance[known] + between)
-    std = np.sqrt(widening(total / float(weights.sum()), len(d)) / total)
-    return float(weights @ d / weights.sum()), float(std)
+    share = weights / total
+    excess = float(weights @ (d - share @ d) ** 2) - more
+    between = excess / (total - float(weights @ share)) if more and excess > 0 else 0.0
+    ratio = 1 + between * total * float(share @ share)
+    return float(np.sqrt(widening(ratio, len(d)) / total))
 
 
 def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, ratio: np.ndarray) -> tuple[HumLine, ...]:
@@ -353,7 +350,6 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
         i = ks.index(int(k) + 1)
         amplitude = float(np.sqrt(max(power[i, j], 0.0)))
         difference = np.sqrt(np.maximum(sizes[:, i, j], 0.0)) - amplitude
-        more, std = _pooled(difference, _inverse(weights[:, i, j]))
-        size = Reported(amplitude + more, std, unit)
+        size = Reported(amplitude, _std_of_mean(difference, _inverse(weights[:, i, j])), unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
