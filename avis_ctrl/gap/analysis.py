@@ -113,9 +113,9 @@ def analyse(
         progress("search with the values of the rig file: the fit moved them further than their tolerances allow")
         again = _searched_from_file(fits, names.updated, prepared, known)
         if again is not None:
-            found = _completed(prepared, again, known)
-            if found[2].updated.labels or not names.updated.labels:
-                prepared, fits, names = found
+            own, again, renamed = _completed(prepared, again, known)
+            if renamed.updated.labels or not names.updated.labels:
+                prepared, fits, names = own, again, renamed
     return _gap(prepared, fits, names, known, seed, began)
 
 
@@ -174,12 +174,10 @@ def _searched_from_file(fits: Fits, updated: Fitted, prepared: Prepared, effects
     least = settings.certain + math.log(step.candidates)
     if step.fitted.log_evidence < tolerant.log_evidence + least:
         return None
-    alone = [one for first in fits.steps[:1] for one in first.tried.values() if len(one.labels) == 1]
-    rivals = {one.labels[0]: refit(one, data, settings.quick).bare() for one in alone}
+    before = fits.steps[0].tried if fits.steps else {}
+    rivals = {label: refit(one, data, settings.quick).bare() for label, one in before.items() if one.labels == (label,)}
     first = replace(step, tried={**rivals, **step.tried})
-    again = _searched(
-        replace(fits, base=base, tolerant=tolerant.bare(), steps=(first,), best=step.fitted), prepared, effects
-    )
+    again = _searched(Fits(base, fits.at_file, tolerant.bare(), (first,), step.fitted), prepared, effects)
     return again if again.best.log_evidence > updated.log_evidence + least else None
 
 

@@ -315,9 +315,9 @@ class Assembled:
 
     @cached_property
     def _owners(self) -> tuple[list[int], ...]:
-        """Owners of the initial states of each kind, in the order of `forces_of_states`: impulses on modes (added
-        coordinate), masses inside (mount), chassis (coordinate) and states defined by effects (count); steps on the
-        same; first-order states (count)."""
+        """What the initial states belong to, by kind, in the order of `forces_of_states`: impulses on modes (index of
+        the added coordinate), masses inside mounts (of the mount), chassis (of the coordinate) and states defined by
+        effects (numbered); steps on the same; first-order states (numbered)."""
         by_effects, decays = (range(sum(one.shape[2] for one in own)) for own in (self.ops.inner, self.ops.decays))
         chassis = np.flatnonzero(self._can_move)
         impulses = [list(map(int, own)) for own in (range(self.n_q - N_Q), self._masses_inside[0], chassis, by_effects)]

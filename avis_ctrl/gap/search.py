@@ -177,7 +177,7 @@ def fit_or_none(
 
 def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> list[Step]:
     """Search for effects; the steps in the order of finding. Values of the rig file beyond their tolerance are searched
-    again at the end: they show in how far one of them had to move, hardly in the residual.
+    again at the end: such a value appears mainly as shifts of the other values, hardly in the residual.
 
     base : the initial fit, which may already contain effects. The last step has the fit with all effects found.
     """
@@ -188,8 +188,7 @@ def search(base: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> lis
         while True:
             now = steps[-1].fitted if steps else base
             progress(f"search for effect {len(now.labels) + 1}")
-            may_follow = searched(now, effects, settings)
-            step = next_effect(now, data, may_follow, run) if may_follow else None
+            step = next_effect(now, data, searched(now, effects, settings), run)
             if step is None:
                 return
             if steps:  # only the last fit needs residual and Jacobian
@@ -313,6 +312,8 @@ def _again(step: Step, best: Fitted, data: Data, settings: GapSettings) -> Step:
 
 def next_effect(now: Fitted, data: Data, effects: Sequence[Effect], run: Run) -> Step | None:
     """The effect with the largest evidence; None if no effect improves the current model enough."""
+    if not effects:
+        return None
     tried, count = _compared(without_path_errors(now, data, run.settings), now, data, effects, run)
     return _with_best(now, tried, count, data, run.settings) if tried else None
 
@@ -348,28 +349,28 @@ def _compared(
     found = candidates(begun, data, effects, run)
     short = shortlist(found, settings)
     run.progress(f"  {len(found)} candidates ranked by the score test, the best {len(short)} are fitted")
-    asked = {one.effect.label for one in short}
-    tried, refused = _tried(begun, short, data, run)
-    better, best = tried, _likeliest(tried, settings) if tried else ""
-    while better or refused:
-        # Values that physics forbids in one law may be possible in another.
-        near = [*refused, *(nearly_best(tried, best, now, settings) if tried else [])]
-        further = [*extensions(list(better.values()), data, settings), *other_laws(found, near, asked)]
+    tried: dict[str, Fitted] = {}
+    asked: set[str] = set()
+    best, further = "", short
+    while further:
         asked |= {one.effect.label for one in further}
-        if further:
-            run.progress(f"  {len(further)} more forms of the best candidates are fitted")
         before = tried
-        more, refused = _tried(begun, further, data, run)
+        more, impossible = _tried(begun, further, data, run)
         tried = _likelier([*before.values(), *more.values()])
-        if not tried:
-            continue
-        best = _likeliest(tried, settings)
-        better = {
-            label: one
+        best = _likeliest(tried, settings) if tried else ""
+        better = [
+            one
             for label, one in more.items()
             if label not in before
             or (label == best and one.log_evidence - before[label].log_evidence > settings.certain)
-        }
+        ]
+        if not (better or impossible):
+            break
+        # Values that physics forbids in one law may be possible in another.
+        near = [*impossible, *(nearly_best(tried, best, now, settings) if tried else [])]
+        further = [*extensions(better, data, settings), *other_laws(found, near, asked)]
+        if further:
+            run.progress(f"  {len(further)} more forms of the best candidates are fitted")
     if not tried:
         return {}, len(found)
     rise = tried[best].log_evidence - now.log_evidence

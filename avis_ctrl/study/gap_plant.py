@@ -224,10 +224,9 @@ def design_files(design: Design, model: TableModel, when: float = 0.0) -> Design
     for one in model.effects:
         name, values = one.effect.name, one.by_name
         own = bool(one.effect.rig_changes(model, one.place, values))
-        fits = name in DESCRIBED_IN and (name != "sensor_gain" or rig.gain_per_sensor)
-        # A design has one pole for all amplifiers, of the mean lag.
-        fits = fits and not (name == "actuator_lag" and "/" in one.place)
-        (inside if own or fits else outside).append(one.label)
+        # A rig file may have one sensitivity for all sensors; a design has one pole for all amplifiers.
+        single = (name == "sensor_gain" and not rig.gain_per_sensor) or (name == "actuator_lag" and "/" in one.place)
+        (inside if own or (name in DESCRIBED_IN and not single) else outside).append(one.label)
         if name == "actuator_gain":
             key = rig.force_constant(one.place)
             changes[key] = changes.get(key, known[key].value) * values["gain"]

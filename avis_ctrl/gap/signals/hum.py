@@ -305,12 +305,8 @@ def _refined(residuals: Sequence[RecordResidual], start: float, hits: np.ndarray
     shift = best([one for lines in records for one in lines])
     each = np.array([best(lines) if lines else shift for lines in records])
     information = [sum(one.information(own) for one in lines) for own, lines in zip(each, records, strict=True)]
-    return Reported(start + shift, _std_of_mean(each - shift, _inverse(np.array(information, float))), "Hz")
-
-
-def _inverse(weights: np.ndarray) -> np.ndarray:
-    """Variances of weights, infinite where there is none."""
-    return np.divide(1.0, weights, out=np.full_like(weights, np.inf), where=weights > 0)
+    variance = np.array([1 / one if one else np.inf for one in information])
+    return Reported(start + shift, _std_of_mean(each - shift, variance), "Hz")
 
 
 def _std_of_mean(difference: np.ndarray, variance: np.ndarray) -> float:
@@ -337,19 +333,20 @@ def _lines(residuals: Sequence[RecordResidual], f0: float, hits: np.ndarray, rat
     names, unit, rate = residuals[0].header.y_names, residuals[0].header.y_unit, residuals[0].header.sample_rate_Hz
     found = []
     ks = sorted({int(k) + 1 for k, _ in hits})
-    sizes, weights = np.zeros((2, len(residuals), len(ks), len(names)))
+    sizes, variances = np.zeros((2, len(residuals), len(ks), len(names)))
     for r, one in enumerate(residuals):
         A = _sines(f0, ks, one.header.samples, rate)
         c = _fitted(A, one.e)
         v = np.array([_spread(one, k * f0) for k in ks])
         # Noise adds 2 v to |a|^2 = a_c^2 + a_s^2; only its radial component changes the amplitude.
         sizes[r] = c[: len(ks)] ** 2 + c[len(ks) :] ** 2 - 2 * v
-        weights[r] = np.divide(1.0, v, out=np.zeros_like(v), where=v > 0)  # a constant channel shows no hum
+        variances[r] = np.where(v > 0, v, np.inf)  # a constant channel shows no hum
+    weights = 1 / variances
     power = np.sum(weights * sizes, axis=0) / np.maximum(np.sum(weights, axis=0), 1e-300)
     for k, j in hits:
         i = ks.index(int(k) + 1)
         amplitude = float(np.sqrt(max(power[i, j], 0.0)))
         difference = np.sqrt(np.maximum(sizes[:, i, j], 0.0)) - amplitude
-        size = Reported(amplitude, _std_of_mean(difference, _inverse(weights[:, i, j])), unit)
+        size = Reported(amplitude, _std_of_mean(difference, variances[:, i, j]), unit)
         found.append(HumLine(names[j], int(k) + 1, size, float(ratio[k, j])))
     return tuple(sorted(found, key=lambda line: -line.amplitude.value))
